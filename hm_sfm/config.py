@@ -1,0 +1,194 @@
+"""The configuration: YAML into nested frozen dataclasses, and fingerprints of what made a result.
+
+The defaults stand here and only here; `configs/light.yaml` spells them out and a test keeps the two equal.
+"""
+
+import dataclasses
+import difflib
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import UnionType
+from typing import Any, get_args, get_type_hints
+
+import yaml
+
+from hm_sfm.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The architecture. A weights file carries its own; a configuration that disagrees is refused."""
+
+    backbone: str = "light"
+    head: str = "homography"
+    """`homography` (the paper) or `expectation` (LoFTR's point-to-patch baseline)."""
+    window: int = 9
+    """w: side of a fine patch, cells of the 1/2 grid."""
+    radius: int = 1
+    """r: radius of the correlation window that is sampled at each iteration."""
+    iterations: int = 3
+    """K: homography updates."""
+    margin: int = 2
+    """Cells by which the patch searched in image 1 is larger on each side (the paper: 0)."""
+
+
+@dataclass(frozen=True)
+class ImageConfig:
+    long_edge_px: int = 1024
+    """Photos are reduced to this size for matching (never enlarged); keypoints are in original pixels."""
+
+
+@dataclass(frozen=True)
+class PairConfig:
+    mode: str = "auto"
+    """auto | exhaustive | sequential | a pairs file."""
+    exhaustive_limit: int = 60
+    """auto matches all pairs up to this many images."""
+    window: int = 5
+    """sequential: each image with so many followers, and with those at distances of powers of two."""
+    spread: int = 10
+    """auto beyond the limit: evenly spread partners added to each image's sequential ones."""
+
+
+@dataclass(frozen=True)
+class MatchingConfig:
+    model: str = "light"
+    """Name of bundled weights, or a file."""
+    coarse_threshold: float = 0.8
+    """light: least cosine similarity of a coarse match."""
+    max_matches: int = 8000
+    """Best-scored matches kept per pair."""
+    feature_cache_mb: int = 1500
+    device: str = "auto"
+
+
+@dataclass(frozen=True)
+class VerificationConfig:
+    """Two-view geometry, before anything is carried and again on the final keypoints."""
+
+    max_error_px: float = 3.0
+    """At the matching resolution; scaled to the photo."""
+    min_inliers: int = 30
+    min_inlier_ratio: float = 0.25
+
+
+@dataclass(frozen=True)
+class KeypointConfig:
+    """Persistence. Distances in px of the matching resolution, scaled to each photo."""
+
+    carry_radius_px: float = 6.0
+    """A patch carries points no farther than this from its centre."""
+    join_radius_px: float = 1.0
+    separation_px: float = 2.0
+    seed_spacing_px: float = 5.0
+    """A patch seeds a keypoint where none is nearer than this."""
+    max_keypoints: int = 8000
+    """Per image, longest tracks first, spread over the image."""
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    mode: str = "auto"
+    """auto | single | per-folder | per-image."""
+    model: str = "SIMPLE_RADIAL"
+    params: str = ""
+    """Known intrinsics, `f,...` in the order of COLMAP's camera model; they stay fixed."""
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    min_model_size: int = 2
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Config:
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    images: ImageConfig = field(default_factory=ImageConfig)
+    pairs: PairConfig = field(default_factory=PairConfig)
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
+    verification: VerificationConfig = field(default_factory=VerificationConfig)
+    keypoints: KeypointConfig = field(default_factory=KeypointConfig)
+    cameras: CameraConfig = field(default_factory=CameraConfig)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+
+
+def parse_config(tree: Any, cls: type, where: str = "the configuration") -> Any:
+    """Build the dataclass `cls` from a tree of dicts; keys that are left out take their defaults.
+
+    Raises ConfigError on an unknown key (naming the nearest one) and on a value of another type.
+    """
+    if tree is None:
+        return cls()
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{where} must be a mapping of keys to values, found {tree!r}")
+    types = get_type_hints(cls)
+    values = {}
+    for key, value in tree.items():
+        if key not in types:
+            near = difflib.get_close_matches(str(key), types, n=1, cutoff=0.0)
+            raise ConfigError(f"unknown key {key!r} in {where}: did you mean {near[0]!r}?")
+        values[key] = _parse_value(value, types[key], f"{where}: {key}")
+    return cls(**values)
+
+
+def _parse_value(value: Any, kind: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(kind):
+        return parse_config(value, kind, where)
+    if isinstance(kind, UnionType):
+        if value is None and type(None) in get_args(kind):
+            return None
+        kind = next(arg for arg in get_args(kind) if arg is not type(None))
+    if kind is float and type(value) is int:
+        return float(value)
+    if type(value) is not kind:
+        raise ConfigError(f"{where} must be of type {kind.__name__}, found {value!r}")
+    return value
+
+
+def read_yaml(path: Path) -> Any:
+    """The YAML tree of a file. Raises ConfigError where it cannot be read or parsed."""
+    try:
+        return yaml.safe_load(Path(path).read_text())
+    except OSError as error:
+        raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+
+
+def load_config(path: Path | None = None, settings: tuple[str, ...] = (), cls: type = Config) -> Any:
+    """Read a configuration file, then apply `section.key=value` settings (values are YAML).
+
+    Returns an instance of `cls`. Raises ConfigError on anything unknown or malformed.
+    """
+    tree = (read_yaml(path) or {}) if path else {}
+    where = str(path) if path else "the configuration"
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{where} must be a mapping of sections, found {tree!r}")
+    for setting in settings:
+        dotted, equals, text = setting.partition("=")
+        if not equals:
+            raise ConfigError(f"--set needs section.key=value, found {setting!r}")
+        *sections, key = dotted.split(".")
+        node = tree
+        for section in sections:
+            node = node.setdefault(section, {})
+            if not isinstance(node, dict):
+                raise ConfigError(f"--set {setting!r}: {section!r} is a value, not a section")
+        try:
+            node[key] = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"--set {setting!r} is not valid YAML") from error
+    return parse_config(tree, cls, where)
+
+
+def fingerprint(*parts: Any) -> str:
+    """16 hex digits that change when any of the parts does (dataclasses, JSON values, paths)."""
+
+    def plain(value: Any) -> Any:
+        return dataclasses.asdict(value) if dataclasses.is_dataclass(value) else str(value)
+
+    text = json.dumps(parts, default=plain, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

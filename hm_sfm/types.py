@@ -1,0 +1,245 @@
+"""The frozen domain types that flow between the stages. Read this first.
+
+Every coordinate is in COLMAP's frame: pixels of the stored (unrotated, full-resolution) image, the pixel in
+column c and row r spans [c, c+1) x [r, r+1), so the centre of the top-left pixel is (0.5, 0.5).
+
+Arrays are copied and made read-only on creation; shape and dtype are checked. M = 0 is valid everywhere.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hm_sfm.neighbours import find_nearest
+
+
+def freeze_array(value: Any, dtype: type, shape: tuple[int | None, ...], what: str) -> np.ndarray:
+    """Copy `value` into a read-only C-contiguous array of `dtype` after checking its shape.
+
+    `None` in `shape` matches any length. Raises ValueError with the expected and the actual shape.
+    """
+    array = np.array(value, dtype=dtype, order="C")
+    fits = array.ndim == len(shape) and all(want in (None, have) for want, have in zip(shape, array.shape))
+    if not fits:
+        expected = "(" + ", ".join("*" if n is None else str(n) for n in shape) + ")"
+        raise ValueError(f"{what} must have shape {expected}, got {array.shape}")
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True)
+class ImageRef:
+    """One photo of the collection. `name` is the key everywhere: its POSIX path relative to the image folder."""
+
+    name: str
+    path: Path
+    size_wh: tuple[int, int]
+    """Stored size, px, before any EXIF rotation."""
+    rotation_deg: int = 0
+    """Clockwise turn (0, 90, 180, 270) that EXIF asks for to show the photo upright."""
+
+    def __post_init__(self) -> None:
+        if self.rotation_deg not in (0, 90, 180, 270):
+            raise ValueError(f"rotation_deg must be 0, 90, 180 or 270, got {self.rotation_deg}")
+
+
+@dataclass(frozen=True, order=True)
+class ImagePair:
+    """Two different image names in sorted order; hashable."""
+
+    name0: str
+    name1: str
+
+    def __post_init__(self) -> None:
+        if not self.name0 < self.name1:
+            raise ValueError(f"an ImagePair needs name0 < name1, got {self.name0!r} and {self.name1!r}")
+
+    @classmethod
+    def of(cls, name_a: str, name_b: str) -> "ImagePair":
+        """The pair of two names given in any order."""
+        return cls(min(name_a, name_b), max(name_a, name_b))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchMatches:
+    """Semi-dense matches of two images with the homography of each matched patch, best score first."""
+
+    xy0: np.ndarray
+    """(M, 2) float32 px: patch centres in image 0."""
+    xy1: np.ndarray
+    """(M, 2) float32 px: where the homographies put these centres in image 1."""
+    score: np.ndarray
+    """(M,) float32 in [0, 1]."""
+    homography: np.ndarray
+    """(M, 3, 3) float32: image 0 px -> image 1 px around match i, scaled so that its denominator is 1 at xy0[i]."""
+    patch_radius_px: float
+    """Half the side of a patch in image 0 px: homography i is estimated from |xy - xy0[i]| <= patch_radius_px."""
+
+    def __post_init__(self) -> None:
+        count = len(self.score)
+        object.__setattr__(self, "xy0", freeze_array(self.xy0, np.float32, (count, 2), "xy0"))
+        object.__setattr__(self, "xy1", freeze_array(self.xy1, np.float32, (count, 2), "xy1"))
+        object.__setattr__(self, "score", freeze_array(self.score, np.float32, (count,), "score"))
+        object.__setattr__(self, "homography", freeze_array(self.homography, np.float32, (count, 3, 3), "homography"))
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+    def warp(self, xy0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Carry points of image 0 into image 1, each by the patch whose centre is nearest.
+
+        xy0: (N, 2) px. Returns xy1 (N, 2) float32 px, NaN where not valid, and valid (N,) bool: a patch centre lies
+        within patch_radius_px.
+        """
+        xy0 = np.asarray(xy0)
+        index, _ = find_nearest(xy0, self.xy0, self.patch_radius_px)
+        valid = index >= 0
+        xy1 = np.full((len(xy0), 2), np.nan, np.float32)
+        xy1[valid] = apply_homographies(self.homography[index[valid]], xy0[valid])
+        return xy1, valid
+
+    def densify(self, radius: int) -> tuple[np.ndarray, np.ndarray]:
+        """The dense matches M_d of the paper: all pixel centres of image 0 around the patch centres.
+
+        radius: px of image 0, at most patch_radius_px; a pixel belongs to the square of that half side around a
+        patch centre. Overlaps go to the nearest centre. Returns xy0 and xy1, (N, 2) float32 px each, row by row.
+        """
+        if not 0 <= radius <= self.patch_radius_px:
+            raise ValueError(f"radius must be within [0, {self.patch_radius_px}] px, got {radius}")
+        steps = np.arange(-radius, radius + 1)
+        square = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        pixels = (np.floor(self.xy0).astype(np.int64)[:, None] + square).reshape(-1, 2)
+        xy0 = (np.unique(pixels[:, ::-1], axis=0)[:, ::-1] + 0.5).astype(np.float32)
+        index, _ = find_nearest(xy0, self.xy0, 1.5 * max(radius, 1))
+        return xy0, apply_homographies(self.homography[index], xy0)
+
+
+def apply_homographies(homography: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Map point i by homography i: (N, 3, 3) and (N, 2) px -> (N, 2) float32 px (computed in float64)."""
+    homography = homography.astype(np.float64)
+    mapped = np.einsum("nij,nj->ni", homography[:, :, :2], xy) + homography[:, :, 2]
+    return (mapped[:, :2] / mapped[:, 2:]).astype(np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairMatches(PatchMatches):
+    """The PatchMatches of a pair of the collection: image 0 is pair.name0."""
+
+    pair: ImagePair
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """The persistent keypoints of one image."""
+
+    name: str
+    xy: np.ndarray
+    """(K, 2) float32 px."""
+    sigma_px: np.ndarray
+    """(K,) float32: estimated standard deviation of the position."""
+    score: np.ndarray
+    """(K,) float32."""
+
+    def __post_init__(self) -> None:
+        count = len(self.score)
+        object.__setattr__(self, "xy", freeze_array(self.xy, np.float32, (count, 2), "xy"))
+        object.__setattr__(self, "sigma_px", freeze_array(self.sigma_px, np.float32, (count,), "sigma_px"))
+        object.__setattr__(self, "score", freeze_array(self.score, np.float32, (count,), "score"))
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+
+@dataclass(frozen=True)
+class IndexMatches:
+    """Matches of one image pair as indices into the Keypoints of its images, one to one."""
+
+    pair: ImagePair
+    indices: np.ndarray
+    """(M, 2) uint32: keypoint of image 0, keypoint of image 1."""
+    score: np.ndarray
+    """(M,) float32."""
+
+    def __post_init__(self) -> None:
+        count = len(self.score)
+        object.__setattr__(self, "indices", freeze_array(self.indices, np.uint32, (count, 2), "indices"))
+        object.__setattr__(self, "score", freeze_array(self.score, np.float32, (count,), "score"))
+        for side in range(2):
+            if len(np.unique(self.indices[:, side])) != count:
+                raise ValueError(f"indices of {self.pair} are not one to one on side {side}")
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Tracks as compressed rows: the observations of track t are offsets[t]:offsets[t + 1].
+
+    A track has at most one observation per image.
+    """
+
+    offsets: np.ndarray
+    """(T + 1,) int64."""
+    image_index: np.ndarray
+    """(O,) int64: index into the list of images."""
+    keypoint_index: np.ndarray
+    """(O,) int64: index into the Keypoints of that image."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "offsets", freeze_array(self.offsets, np.int64, (None,), "offsets"))
+        count = int(self.offsets[-1]) if len(self.offsets) else -1
+        if count < 0 or self.offsets[0] != 0 or np.any(np.diff(self.offsets) < 0):
+            raise ValueError("offsets must start at 0, never decrease and have at least one entry")
+        object.__setattr__(self, "image_index", freeze_array(self.image_index, np.int64, (count,), "image_index"))
+        object.__setattr__(
+            self, "keypoint_index", freeze_array(self.keypoint_index, np.int64, (count,), "keypoint_index")
+        )
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+
+@dataclass(frozen=True)
+class PinholeView:
+    """A camera whose intrinsics and pose are known: a view to render, or the truth about a photo."""
+
+    K: np.ndarray
+    """(3, 3) float64 px, in COLMAP's frame."""
+    size_wh: tuple[int, int]
+    cam_from_world: np.ndarray
+    """(3, 4) float64: rigid; the camera looks along its +z, its y points down."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "K", freeze_array(self.K, np.float64, (3, 3), "K"))
+        object.__setattr__(
+            self, "cam_from_world", freeze_array(self.cam_from_world, np.float64, (3, 4), "cam_from_world")
+        )
+
+    @property
+    def center(self) -> np.ndarray:
+        """(3,) float64: where the camera stands, in the world."""
+        return -self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3]
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """World points (N, 3) -> their px (N, 2) and z-depths (N,), float64; px mean nothing where depth <= 0."""
+        rays = (points @ self.cam_from_world[:, :3].T + self.cam_from_world[:, 3]) @ self.K.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return rays[:, :2] / rays[:, 2:], rays[:, 2]
+
+
+@dataclass(frozen=True)
+class MappingResult:
+    """The models that the mapper built, and the figures of summary.json about the largest of them."""
+
+    models: tuple[Any, ...]
+    """pycolmap.Reconstruction, largest (most registered images) first."""
+    num_images: int
+    registered: int
+    points: int
+    observations: int
+    mean_track_length: float
+    """In distinct images."""
+    mean_reprojection_px: float

@@ -1,0 +1,85 @@
+"""The identities of the one frame of coordinates."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hm_sfm.coordinates import Grid, pixel_index_from_px, px_from_pixel_index, rotate_px, rotation_matrix
+
+sides = st.integers(1, 5000)
+rotations = st.sampled_from((0, 90, 180, 270))
+coordinates = st.floats(-1e4, 1e4, allow_nan=False)
+
+
+def turned_size(size_wh, rotation_deg):
+    return size_wh if rotation_deg in (0, 180) else size_wh[::-1]
+
+
+@given(width=sides, height=sides, rotation=rotations, x=coordinates, y=coordinates)
+def test_turning_there_and_back_is_the_identity(width, height, rotation, x, y):
+    xy = np.array([[x, y]])
+    there = rotate_px(xy, (width, height), rotation)
+    back = rotate_px(there, turned_size((width, height), rotation), -rotation % 360)
+    np.testing.assert_allclose(back, xy, atol=1e-9)
+
+
+@given(width=sides, height=sides, rotation=rotations)
+def test_rotation_matrix_of_the_turn_back_is_the_inverse(width, height, rotation):
+    there = rotation_matrix((width, height), rotation)
+    back = rotation_matrix(turned_size((width, height), rotation), -rotation % 360)
+    assert np.array_equal(back @ there, np.eye(3))
+
+
+@given(width=sides, height=sides, x=coordinates, y=coordinates)
+def test_two_quarter_turns_are_a_half_turn(width, height, x, y):
+    xy = np.array([x, y])
+    twice = rotate_px(rotate_px(xy, (width, height), 90), (height, width), 90)
+    np.testing.assert_allclose(twice, rotate_px(xy, (width, height), 180), atol=1e-9)
+
+
+@given(
+    width=st.integers(1, 9), height=st.integers(1, 9), rotation=rotations, column=st.integers(0), row=st.integers(0)
+)
+def test_points_turn_as_pixels_do(width, height, rotation, column, row):
+    column, row = column % width, row % height
+    impulse = np.zeros((height, width))
+    impulse[row, column] = 1
+    turned_row, turned_column = np.argwhere(np.rot90(impulse, -rotation // 90))[0]  # rot90 counts anticlockwise
+    centre = px_from_pixel_index(np.array([column, row], dtype=np.float64))
+    turned_centre = px_from_pixel_index(np.array([turned_column, turned_row], dtype=np.float64))
+    assert np.array_equal(rotate_px(centre, (width, height), rotation), turned_centre)
+    assert np.array_equal(rotation_matrix((width, height), rotation) @ [*centre, 1], [*turned_centre, 1])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_rotate_px_keeps_shape_and_dtype(dtype):
+    for shape in ((0, 2), (2,), (3, 4, 2)):
+        turned = rotate_px(np.zeros(shape, dtype), (40, 30), 90)
+        assert turned.shape == shape and turned.dtype == dtype
+
+
+@given(x=st.integers(-10000, 10000), y=st.integers(-10000, 10000))
+def test_pixel_index_round_trip(x, y):
+    index = np.array([x, y], dtype=np.float64)
+    assert np.array_equal(pixel_index_from_px(px_from_pixel_index(index)), index)
+
+
+def test_the_top_left_pixel_has_its_centre_at_one_half():
+    assert np.array_equal(px_from_pixel_index(np.zeros(2)), [0.5, 0.5])
+
+
+@given(
+    stride=st.sampled_from((1, 2, 4, 8, 16)),
+    offset=st.sampled_from((0.0, 0.5, 1.0, 4.0)),
+    cells=st.lists(st.integers(0, 2000), max_size=5),
+)
+def test_grid_round_trip(stride, offset, cells):
+    grid = Grid(stride, offset)
+    cells = np.array(cells, dtype=np.float64)
+    assert np.array_equal(grid.from_px(grid.to_px(cells)), cells)
+
+
+def test_a_pooled_grid_has_its_cells_at_the_mean_of_their_pixel_centres():
+    pixel_centres = px_from_pixel_index(np.arange(32.0))
+    assert np.array_equal(Grid(8, 4.0).to_px(np.arange(4.0)), pixel_centres.reshape(4, 8).mean(1))

@@ -1,0 +1,173 @@
+"""Stage 2: which images to match with which."""
+
+import itertools
+import os
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from hm_sfm.config import PairConfig
+from hm_sfm.errors import ConfigError, InputError
+from hm_sfm.types import ImagePair
+
+MAX_NAMES_LISTED = 20
+
+# One name of a pairs file: in double quotes (a quote inside is doubled), or bare.
+NAME = r'(?:"(?:[^"]|"")*"|[^ \t"][^ \t]*)'
+TWO_NAMES = re.compile(rf"[ \t]*({NAME})[ \t]+({NAME})[ \t]*")
+# What may stand bare: no white space or quote, and no comment or byte-order mark at its start.
+BARE_NAME = re.compile(r'[^\s"#\ufeff][^\s"]*')
+
+
+def select_pairs(names: Sequence[str], config: PairConfig) -> tuple[ImagePair, ...]:
+    """The pairs to match among the images `names`, as `config.mode` says: auto, exhaustive, sequential or a file.
+
+    auto takes all pairs of up to `config.exhaustive_limit` images, and of more the sequential pairs plus
+    `config.spread` evenly spaced partners of each image.
+
+    Raises InputError where there are fewer than two images or the pairs file is unusable, ConfigError where the mode
+    does not exist.
+    """
+    if len(names) < 2:
+        raise InputError(f"at least 2 images are needed to make a pair, found {len(names)}")
+    if config.mode == "retrieval":
+        raise ConfigError("pairs mode 'retrieval' does not exist yet: use 'auto', or a pairs file made by another tool")
+    if config.mode == "exhaustive" or (config.mode == "auto" and len(names) <= config.exhaustive_limit):
+        return pair_exhaustively(names)
+    if config.mode == "sequential":
+        return pair_sequentially(names, config.window)
+    if config.mode == "auto":
+        pairs = pair_sequentially(names, config.window) + pair_evenly(names, config.spread)
+        return tuple(dict.fromkeys(pairs))
+    if not Path(config.mode).exists():
+        raise InputError(f"pairs {config.mode!r} is neither auto, exhaustive or sequential nor a file that exists")
+    return read_pairs(Path(config.mode), names)
+
+
+def pair_exhaustively(names: Sequence[str]) -> tuple[ImagePair, ...]:
+    """All pairs of different images, in the order of `names`."""
+    return tuple(ImagePair.of(a, b) for a, b in itertools.combinations(names, 2))
+
+
+def pair_sequentially(names: Sequence[str], window: int) -> tuple[ImagePair, ...]:
+    """Each image with its next `window` images and with those at distances of powers of two beyond.
+
+    The sequence is the natural order of `names`: numbers compare as numbers, img2 before img10.
+
+    Raises ConfigError where window is below 1.
+    """
+    if window < 1:
+        raise ConfigError(f"pairs.window must be at least 1, found {window}")
+    ordered = sorted(names, key=_natural_key)
+    powers = [2**k for k in range(len(ordered).bit_length()) if 2**k > window]
+    distances = [*range(1, min(window, len(ordered)) + 1), *powers]
+    return tuple(
+        ImagePair.of(name, ordered[i + distance])
+        for i, name in enumerate(ordered)
+        for distance in distances
+        if i + distance < len(ordered)
+    )
+
+
+def pair_evenly(names: Sequence[str], spread: int) -> tuple[ImagePair, ...]:
+    """Each image with `spread` partners that divide the sequence evenly, taken as a ring; fewer if there are fewer.
+
+    Where both `spread` and the number of images are odd, each image gets one partner more. The sequence is the natural
+    order of `names`.
+
+    Raises ConfigError where spread is negative.
+    """
+    if spread < 0:
+        raise ConfigError(f"pairs.spread must not be negative, found {spread}")
+    ordered = sorted(names, key=_natural_key)
+    count = len(ordered)
+    # Half of the ring: the partners in the other half are those whose own distances reach back.
+    distances = sorted({round(k * count / (spread + 1)) for k in range(1, (spread + 1) // 2 + 1)} - {0})
+    pairs = (ImagePair.of(ordered[i], ordered[(i + distance) % count]) for i in range(count) for distance in distances)
+    return tuple(dict.fromkeys(pairs))
+
+
+def read_pairs(path: Path, names: Sequence[str]) -> tuple[ImagePair, ...]:
+    """Read a pairs file, in the order of its lines: one pair a line, the two names separated by a space or a tab.
+
+    A name with spaces stands in double quotes (a quote inside is doubled), or a single tab separates the names. Blank
+    lines and lines that start with # are ignored.
+
+    Raises InputError, naming file and line, where the file cannot be read, a line does not hold two names, an image
+    is unknown (all unknown ones are listed), paired with itself, or a pair is repeated in either order; and where
+    there is no pair at all.
+    """
+    path = Path(path)
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(f"cannot read the pairs file {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"the pairs file {path} is not UTF-8 text") from error
+
+    known = set(names)
+    unknown: dict[str, int] = {}
+    line_of_pair: dict[ImagePair, int] = {}
+    # Not splitlines(), which also splits at characters that may stand in names.
+    for number, line in enumerate(text.split("\n"), start=1):
+        line = line.removesuffix("\r")
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        where = f"{path}, line {number}"
+        name_a, name_b = _parse_line(line, where)
+        for name in (name_a, name_b):
+            if name not in known:
+                unknown.setdefault(name, number)
+        if name_a == name_b:
+            raise InputError(f"{where}: {name_a!r} is paired with itself")
+        pair = ImagePair.of(name_a, name_b)
+        if pair in line_of_pair:
+            raise InputError(f"{where}: repeats the pair of line {line_of_pair[pair]}, {name_a!r} and {name_b!r}")
+        line_of_pair[pair] = number
+    if unknown:
+        listed = [f"{name!r} (line {number})" for name, number in unknown.items()]
+        rest = f" and {len(listed) - MAX_NAMES_LISTED} more" if len(listed) > MAX_NAMES_LISTED else ""
+        raise InputError(f"{path} names images that are not there: {', '.join(listed[:MAX_NAMES_LISTED])}{rest}")
+    if not line_of_pair:
+        raise InputError(f"the pairs file {path} holds no pair")
+    return tuple(line_of_pair)
+
+
+def write_pairs(path: Path, pairs: Iterable[ImagePair]) -> None:
+    """Write a pairs file that `read_pairs`, and where no name needs quotes also hloc and COLMAP, can read.
+
+    Raises InputError where a name holds a line break.
+    """
+    path = Path(path)
+    lines = [f"{_quote(pair.name0)} {_quote(pair.name1)}\n" for pair in pairs]
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_bytes("".join(lines).encode())
+    os.replace(temporary, path)
+
+
+def _parse_line(line: str, where: str) -> tuple[str, str]:
+    match = TWO_NAMES.fullmatch(line)
+    parts = match.groups() if match else [part.strip(" ") for part in line.strip().split("\t")]
+    if len(parts) != 2 or not all(parts):
+        raise InputError(
+            f"{where}: expected two names, found {line.strip()[:100]!r}; names with spaces "
+            "need double quotes, or a tab between the two"
+        )
+    return _unquote(parts[0]), _unquote(parts[1])
+
+
+def _quote(name: str) -> str:
+    if "\n" in name or "\r" in name:
+        raise InputError(f"the image name {name!r} holds a line break, which a pairs file cannot")
+    return name if BARE_NAME.fullmatch(name) else '"' + name.replace('"', '""') + '"'
+
+
+def _unquote(text: str) -> str:
+    is_quoted = len(text) >= 2 and text.startswith('"') and text.endswith('"')
+    return text[1:-1].replace('""', '"') if is_quoted else text
+
+
+def _natural_key(name: str) -> tuple[list[str | int], str]:
+    parts: list[str | int] = list(re.split("([0-9]+)", name))
+    parts[1::2] = map(int, parts[1::2])
+    return parts, name

@@ -1,0 +1,320 @@
+"""Two-view verification, incremental mapping and bundle adjustment, through pycolmap.
+
+Ctrl-C raises KeyboardInterrupt out of each of these functions within a second or so: pycolmap asks for signals while
+it works, only the last adjustment of a model runs through. What is written to disk appears at once and complete, or
+not at all.
+"""
+
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from tqdm import tqdm
+
+from hm_sfm.config import MappingConfig, VerificationConfig
+from hm_sfm.database import open_database
+from hm_sfm.types import ImagePair, ImageRef, MappingResult, PairMatches, freeze_array
+
+# Fewer matches than this prove nothing about an epipolar geometry.
+FEWEST_MATCHES = 8
+
+# verify_pair fits the geometry to at most so many matches and then tests all of them: the time of a trial grows with
+# the matches, the precision of the fit hardly does.
+FIT_MATCHES = 1000
+
+# Enough for 30 % inliers; pairs with more stop earlier, and pairs of different places never need to find anything.
+MAX_TRIALS = 1500
+
+# Global bundle adjustment each time the model grew by 30 %, not COLMAP's 10 %: about a fifth less time on dense
+# keypoints, at the same result; local bundle adjustment follows every image anyway.
+GLOBAL_ADJUSTMENT_RATIO = 1.3
+
+
+@dataclass(frozen=True)
+class VerifiedPair:
+    """A pair of images whose matches agree with a two-view geometry."""
+
+    pair: ImagePair
+    inliers: np.ndarray
+    """(M,) bool: which of the pair's matches agree."""
+    strength: float
+    """Number of inliers times the share of the image that they cover, in the image where it is smaller."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "inliers", freeze_array(self.inliers, np.bool_, (None,), "inliers"))
+
+
+@contextmanager
+def _quiet_colmap() -> Iterator[None]:
+    """Keep COLMAP's progress messages off stderr; its warnings and errors still show."""
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = max(before, int(pycolmap.logging.WARNING))
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def _two_view_options(max_error_px: float, min_inliers: int, min_inlier_ratio: float, seed: int):
+    options = pycolmap.TwoViewGeometryOptions()
+    options.min_num_inliers = min_inliers
+    options.min_inlier_ratio = min_inlier_ratio
+    options.detect_watermark = False  # a label that nothing here reads
+    options.ransac.max_error = max_error_px
+    options.ransac.max_num_trials = MAX_TRIALS
+    options.ransac.random_seed = seed
+    return options
+
+
+def verify_pair(
+    matches: PairMatches,
+    camera0: pycolmap.Camera,
+    camera1: pycolmap.Camera,
+    max_error_px: float,
+    min_inliers: int,
+    min_inlier_ratio: float,
+    seed: int = 0,
+) -> np.ndarray:
+    """Which matches agree with the two-view geometry of their images.
+
+    camera0, camera1: of image 0 and 1; where both have a known focal length, the geometry is calibrated. Pairs that
+    see a plane, or that only rotate, are valid: matches then agree with a homography.
+    max_error_px: px of the stored images.
+
+    Returns (M,) bool, the same for the same seed; all False where fewer than `min_inliers` or a smaller part than
+    `min_inlier_ratio` of the matches agree, and for fewer than 8 matches.
+    """
+    rejected = np.zeros(len(matches), dtype=bool)
+    if len(matches) < FEWEST_MATCHES:
+        return rejected
+    xy0 = matches.xy0.astype(np.float64)
+    xy1 = matches.xy1.astype(np.float64)
+    # Matches come best first: even steps keep the mixture of good and bad, and the spread over the image.
+    chosen = np.linspace(0, len(matches) - 1, min(len(matches), FIT_MATCHES)).round().astype(np.int64)
+    identity = np.repeat(np.arange(len(chosen), dtype=np.uint32)[:, None], 2, axis=1)
+    with _quiet_colmap():
+        geometry = pycolmap.estimate_two_view_geometry(
+            camera0,
+            xy0[chosen],
+            camera1,
+            xy1[chosen],
+            identity,
+            _two_view_options(max_error_px, FEWEST_MATCHES, 0.0, seed),
+        )
+
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    kind = kinds(geometry.config)
+    inliers = rejected
+    if kind == kinds.UNCALIBRATED:
+        inliers = _epipolar_inliers(xy0, xy1, geometry.F, max_error_px)
+    elif kind in (kinds.CALIBRATED, kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):
+        # As COLMAP does: a plane that dominates the pair must not cost it what stands before the plane.
+        if geometry.E is not None:
+            max_error = np.mean([camera.cam_from_img_threshold(max_error_px) for camera in (camera0, camera1)])
+            inliers = _epipolar_inliers(camera0.cam_from_img(xy0), camera1.cam_from_img(xy1), geometry.E, max_error)
+        if kind != kinds.CALIBRATED:
+            planar = _planar_inliers(xy0, xy1, geometry.H, max_error_px)
+            inliers = max(inliers, planar, key=np.count_nonzero)
+    accepted = np.count_nonzero(inliers) >= max(min_inliers, min_inlier_ratio * len(matches))
+    return inliers if accepted else rejected
+
+
+def _epipolar_inliers(xy0: np.ndarray, xy1: np.ndarray, matrix: np.ndarray, max_error: float) -> np.ndarray:
+    """(M,) bool: Sampson error within `max_error`, in the units of the points; points (M, 2), NaN is no inlier."""
+    squared = np.array(pycolmap.compute_squared_sampson_error(xy0, xy1, matrix))
+    return squared <= max_error**2
+
+
+def _planar_inliers(xy0: np.ndarray, xy1: np.ndarray, homography: np.ndarray, max_error_px: float) -> np.ndarray:
+    """(M,) bool: the homography puts the point of image 0 within `max_error_px` of its match; points (M, 2) px."""
+    projected = np.column_stack([xy0, np.ones(len(xy0))]) @ homography.T
+    with np.errstate(divide="ignore", invalid="ignore"):  # points on the horizon are no inliers
+        offset = projected[:, :2] / projected[:, 2:] - xy1
+    return (offset**2).sum(axis=1) <= max_error_px**2
+
+
+def verify_pairs(
+    images: Sequence[ImageRef],
+    pairs: Sequence[ImagePair],
+    read: Callable[[ImagePair], PairMatches],
+    cameras: Mapping[str, pycolmap.Camera],
+    px_per_unit: Mapping[str, float],
+    config: VerificationConfig,
+    quiet: bool = False,
+) -> dict[ImagePair, VerifiedPair]:
+    """verify_pair for many pairs; pairs that are rejected are left out.
+
+    read: gives the matches of a pair. cameras, px_per_unit: by image name; px of the stored image per px of the
+    matching resolution, in which `config` states the error. quiet: no progress bar.
+    """
+    size_wh = {image.name: image.size_wh for image in images}
+    verified = {}
+    for pair in tqdm(pairs, desc="verify", unit="pair", disable=quiet):
+        matches = read(pair)
+        inliers = verify_pair(
+            matches,
+            cameras[pair.name0],
+            cameras[pair.name1],
+            config.max_error_px * max(px_per_unit[pair.name0], px_per_unit[pair.name1]),
+            config.min_inliers,
+            config.min_inlier_ratio,
+        )
+        if inliers.any():
+            cover0 = measure_cover(matches.xy0[inliers], size_wh[pair.name0])
+            cover1 = measure_cover(matches.xy1[inliers], size_wh[pair.name1])
+            verified[pair] = VerifiedPair(pair, inliers, np.count_nonzero(inliers) * min(cover0, cover1))
+    return verified
+
+
+def measure_cover(xy: np.ndarray, size_wh: tuple[int, int]) -> float:
+    """Share of the cells of an 8 x 8 division of the image that hold a point. xy: (N, 2) px."""
+    cell = np.clip((xy / np.array(size_wh) * 8).astype(int), 0, 7)
+    return len(np.unique(cell[:, 1] * 8 + cell[:, 0])) / 64
+
+
+def verify_database(
+    path: Path,
+    max_error_px: float,
+    min_inliers: int,
+    min_inlier_ratio: float,
+    seed: int = 0,
+    num_threads: int = -1,
+) -> None:
+    """Estimate the two-view geometry of all matched pairs of a database and store it there, replacing earlier ones.
+
+    max_error_px: px of the stored images. num_threads: -1 takes all cores. Raises InputError where there is no
+    database.
+    """
+    with open_database(path) as database:
+        database.clear_two_view_geometries()  # pycolmap skips pairs that have one
+    verifier = pycolmap.GeometricVerifierOptions(num_threads=num_threads)
+    # Ctrl-C takes effect between batches.
+    pairing = pycolmap.ExistingMatchedPairingOptions(batch_size=4 * (os.cpu_count() or 1))
+    options = _two_view_options(max_error_px, min_inliers, min_inlier_ratio, seed)
+    with _quiet_colmap():
+        pycolmap.geometric_verification(path, verifier, pairing, options)
+
+
+def map_incrementally(
+    database_path: Path,
+    image_folder: Path,
+    sparse_folder: Path,
+    config: MappingConfig,
+    fix_intrinsics: bool,
+    on_image: Callable[[], None] | None = None,
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """Build models from a verified database with COLMAP's incremental mapper, then adjust and filter each of them.
+
+    image_folder: for the colours of the points. fix_intrinsics: keep all cameras as the database has them.
+    on_image: called once per registered image; the mapper may register an image again in another model or attempt.
+
+    Returns the models, most registered images first, then most points. They are also in `sparse_folder`/0, 1, ... as
+    COLMAP binary, in this order; what the folder held before is gone, and without a model there is no folder.
+    Raises InputError where there is no database.
+    """
+    sparse_folder = Path(sparse_folder)
+    sparse_folder.parent.mkdir(parents=True, exist_ok=True)
+    with open_database(database_path) as database:
+        can_map = database.num_inlier_matches() > 0  # rejected pairs count as verified pairs, without inliers
+    with tempfile.TemporaryDirectory(dir=sparse_folder.parent, prefix=f".{sparse_folder.name}.") as temporary:
+        models: list[pycolmap.Reconstruction] = []
+        if can_map:
+            raw = Path(temporary) / "mapper"
+            raw.mkdir()
+            with _quiet_colmap():
+                models = _run_mapper(database_path, image_folder, raw, config, fix_intrinsics, on_image)
+        models.sort(key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
+
+        finished = Path(temporary) / "sparse"
+        for number, model in enumerate(models):
+            folder = finished / str(number)
+            folder.mkdir(parents=True)
+            model.write_binary(folder)
+        if sparse_folder.exists():
+            os.replace(sparse_folder, Path(temporary) / "replaced")
+        if models:
+            os.replace(finished, sparse_folder)
+    return tuple(models)
+
+
+def _run_mapper(
+    database_path: Path,
+    image_folder: Path,
+    output_folder: Path,
+    config: MappingConfig,
+    fix_intrinsics: bool,
+    on_image: Callable[[], None] | None,
+) -> list[pycolmap.Reconstruction]:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = config.seed
+    options.min_model_size = config.min_model_size
+    options.ba_global_frames_ratio = GLOBAL_ADJUSTMENT_RATIO
+    options.ba_global_points_ratio = GLOBAL_ADJUSTMENT_RATIO
+    if fix_intrinsics:
+        options.ba_refine_focal_length = False
+        options.ba_refine_principal_point = False
+        options.ba_refine_extra_params = False
+        options.max_extra_param = np.inf  # known distortion, however strong, is no sign of a failed calibration
+
+    def on_initial_pair() -> None:
+        on_image()
+        on_image()
+
+    models = pycolmap.incremental_mapping(
+        database_path,
+        image_folder,
+        output_folder,
+        options,
+        initial_image_pair_callback=on_initial_pair if on_image else None,
+        next_image_callback=on_image,
+    )
+    for model in models.values():
+        _adjust(model, options)
+    return list(models.values())
+
+
+def _adjust(model: pycolmap.Reconstruction, options: pycolmap.IncrementalPipelineOptions) -> None:
+    """Adjust all of a model once more, and drop observations as COLMAP's mapper does after each adjustment."""
+    adjustment = pycolmap.BundleAdjustmentOptions()
+    adjustment.refine_focal_length = options.ba_refine_focal_length
+    adjustment.refine_principal_point = options.ba_refine_principal_point
+    adjustment.refine_extra_params = options.ba_refine_extra_params
+    adjustment.print_summary = False
+    extent = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        extent.add_image(image_id)
+    extent.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Not pycolmap.bundle_adjustment, which does the same but turns COLMAP's messages back on.
+    pycolmap.create_default_bundle_adjuster(adjustment, extent, model).solve()
+    limits = options.mapper
+    pycolmap.ObservationManager(model).filter_all_points3D(limits.filter_max_reproj_error, limits.filter_min_tri_angle)
+    model.update_point_3d_errors()
+
+
+def summarise_models(models: Sequence[pycolmap.Reconstruction], num_images: int) -> MappingResult:
+    """The figures of the largest model, `models[0]`; all 0 where there is none.
+
+    num_images: of the collection, registered or not. A track's length is the number of distinct images that see it;
+    mean_reprojection_px is the mean over the points of each point's mean error, as COLMAP prints it.
+    """
+    if not models:
+        return MappingResult((), num_images, 0, 0, 0, 0.0, 0.0)
+    model = models[0]
+    points = model.num_points3D()
+    sightings = sum(
+        len({point2D.point3D_id for point2D in image.get_observation_points2D()}) for image in model.images.values()
+    )
+    return MappingResult(
+        models=tuple(models),
+        num_images=num_images,
+        registered=model.num_reg_images(),
+        points=points,
+        observations=model.compute_num_observations(),
+        mean_track_length=sightings / points if points else 0.0,
+        mean_reprojection_px=model.compute_mean_reprojection_error(),
+    )

@@ -1,0 +1,270 @@
+"""What hm_sfm.database promises to COLMAP, and hm_sfm.exif to hm_sfm.database."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from hm_sfm.config import CameraConfig
+from hm_sfm.database import Cameras, make_cameras, read_image_ids, write_database
+from hm_sfm.errors import ConfigError, InputError
+from hm_sfm.exif import write_jpeg
+from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
+
+
+def make_photo(
+    folder: Path, name: str, focal_35mm: float | None = None, size_wh: tuple[int, int] = (60, 40), orientation: int = 1
+) -> ImageRef:
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_jpeg(path, np.full((size_wh[1], size_wh[0], 3), 128, np.uint8), focal_35mm, orientation)
+    return ImageRef(name, path, size_wh)
+
+
+def make_keypoints(name: str, count: int, seed: int = 0) -> Keypoints:
+    xy = np.random.default_rng(seed).uniform(0, 60, (count, 2))
+    return Keypoints(name, xy, np.ones(count), np.ones(count))
+
+
+def make_index_matches(name0: str, name1: str, indices: list[tuple[int, int]]) -> IndexMatches:
+    return IndexMatches(ImagePair(name0, name1), np.reshape(indices, (-1, 2)), np.ones(len(indices)))
+
+
+# EXIF
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_written_focal_and_orientation_are_read_back_by_pycolmap(tmp_path, orientation):
+    photo = make_photo(tmp_path, "a.jpg", 28.0, (600, 400), orientation)
+    bitmap = pycolmap.Bitmap.read(photo.path, as_rgb=True)
+    assert bitmap.exif_focal_length() == pytest.approx(28 / 43.27 * np.hypot(600, 400), rel=1e-3)
+    assert bitmap.exif_orientation() == orientation
+    assert bitmap.to_array().shape == (400, 600, 3)
+
+
+def test_jpeg_keeps_the_channel_order_and_leaves_no_other_file(tmp_path):
+    image = np.zeros((16, 24, 3), np.uint8)
+    image[:, :, 0] = 250
+    write_jpeg(tmp_path / "red.jpg", image, None)
+    bitmap = pycolmap.Bitmap.read(tmp_path / "red.jpg", as_rgb=True)
+    assert bitmap.exif_focal_length() is None
+    np.testing.assert_allclose(bitmap.to_array(), image, atol=6)
+    assert [path.name for path in tmp_path.iterdir()] == ["red.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("image", "focal_35mm", "orientation"),
+    [
+        (np.zeros((4, 4), np.uint8), None, 1),
+        (np.zeros((4, 4, 3), np.float32), None, 1),
+        (np.zeros((4, 4, 3), np.uint8), 0.2, 1),
+        (np.zeros((4, 4, 3), np.uint8), 28.0, 9),
+    ],
+)
+def test_jpeg_refuses_what_it_cannot_hold(tmp_path, image, focal_35mm, orientation):
+    with pytest.raises(ValueError):
+        write_jpeg(tmp_path / "a.jpg", image, focal_35mm, orientation)
+    assert not list(tmp_path.iterdir())
+
+
+# Cameras
+
+
+@pytest.mark.parametrize("focal_35mm", [28.0, None])
+def test_focal_is_the_one_that_pycolmap_infers(tmp_path, focal_35mm):
+    photo = make_photo(tmp_path, "a.jpg", focal_35mm)
+    camera = make_cameras([photo], CameraConfig()).cameras[0]
+    expected = pycolmap.infer_camera_from_image(photo.path)
+    assert camera.model == expected.model
+    assert (camera.width, camera.height) == (60, 40)
+    np.testing.assert_array_equal(camera.params, expected.params)
+    assert camera.has_prior_focal_length == expected.has_prior_focal_length == (focal_35mm is not None)
+
+
+def test_auto_shares_one_camera_across_folders_where_all_agree(tmp_path):
+    photos = [make_photo(tmp_path, name, 28.0) for name in ("a.jpg", "left/b.jpg", "right/c.jpg")]
+    assert make_cameras(photos, CameraConfig()).camera_index == (0, 0, 0)
+
+
+def test_auto_splits_by_folder_size_and_focal_where_they_differ(tmp_path):
+    photos = [
+        make_photo(tmp_path, "x/a.jpg", 28.0),
+        make_photo(tmp_path, "x/b.jpg", 50.0),
+        make_photo(tmp_path, "x/c.jpg", 28.0),
+        make_photo(tmp_path, "y/d.jpg", 28.0),
+        make_photo(tmp_path, "x/e.jpg", 28.0, (40, 60)),
+        make_photo(tmp_path, "x/f.jpg", None),
+    ]
+    cameras = make_cameras(photos, CameraConfig())
+    assert cameras.camera_index == (0, 1, 0, 2, 3, 4)
+    assert [camera.camera_id for camera in cameras.cameras] == [1, 2, 3, 4, 5]
+    assert (cameras.cameras[3].width, cameras.cameras[3].height) == (40, 60)
+    assert [camera.has_prior_focal_length for camera in cameras.cameras] == [True, True, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("mode", "expected"), [("single", (0, 0, 0)), ("per-folder", (0, 1, 0)), ("per-image", (0, 1, 2))]
+)
+def test_modes_group_as_they_say(tmp_path, mode, expected):
+    photos = [make_photo(tmp_path, "x/a.jpg"), make_photo(tmp_path, "y/b.jpg"), make_photo(tmp_path, "x/c.jpg", 50.0)]
+    cameras = make_cameras(photos, CameraConfig(mode=mode))
+    assert cameras.camera_index == expected
+    # A camera takes the focal length from whichever of its images has one.
+    assert cameras.cameras[expected[2]].has_prior_focal_length
+
+
+@pytest.mark.parametrize("mode", ["single", "per-folder"])
+def test_shared_camera_needs_equal_sizes(tmp_path, mode):
+    photos = [make_photo(tmp_path, "a.jpg"), make_photo(tmp_path, "b.jpg", size_wh=(40, 60))]
+    with pytest.raises(InputError, match=r"a\.jpg \(60 x 40 px\) and b\.jpg \(40 x 60 px\)"):
+        make_cameras(photos, CameraConfig(mode=mode))
+
+
+def test_known_params_need_one_size_even_in_auto_mode(tmp_path):
+    photos = [make_photo(tmp_path, "a.jpg"), make_photo(tmp_path, "b.jpg", size_wh=(62, 42))]
+    with pytest.raises(InputError, match="sizes differ"):
+        make_cameras(photos, CameraConfig(model="PINHOLE", params="70,71,30,20"))
+
+
+def test_known_params_are_taken_as_they_are(tmp_path):
+    photos = [make_photo(tmp_path, "x/a.jpg", 28.0), make_photo(tmp_path, "y/b.jpg", 50.0)]
+    cameras = make_cameras(photos, CameraConfig(model="PINHOLE", params="70, 71.5,30,20"))
+    assert cameras.camera_index == (0, 0)
+    assert cameras.cameras[0].model_name == "PINHOLE"
+    np.testing.assert_array_equal(cameras.cameras[0].params, [70, 71.5, 30, 20])
+    assert cameras.cameras[0].has_prior_focal_length
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (CameraConfig(model="PINHOL"), "did you mean 'PINHOLE'"),
+        (CameraConfig(model="simple_radial"), "did you mean 'SIMPLE_RADIAL'"),
+        (CameraConfig(model="INVALID"), "unknown camera model"),
+        (CameraConfig(model="PINHOLE", params="70,30,20"), r"expects 4 numbers \(fx, fy, cx, cy\), found '70,30,20'"),
+        (CameraConfig(model="PINHOLE", params="70,70,30,x"), "expects 4 numbers"),
+        (CameraConfig(model="PINHOLE", params="70,70,30,nan"), "expects 4 numbers"),
+        (CameraConfig(model="PINHOLE", params="-70,70,30,20"), "focal length must be positive"),
+        (CameraConfig(model="PINHOLE", params="70,70,300,20"), "principal point within 60 x 40 px"),
+        (CameraConfig(mode="folder"), "per-folder"),
+    ],
+)
+def test_bad_camera_configurations_are_refused(tmp_path, config, message):
+    with pytest.raises(ConfigError, match=message):
+        make_cameras([make_photo(tmp_path, "a.jpg")], config)
+
+
+def test_unreadable_image_is_named(tmp_path):
+    (tmp_path / "broken.jpg").write_bytes(b"no image")
+    with pytest.raises(InputError, match=r"broken\.jpg"):
+        make_cameras([ImageRef("broken.jpg", tmp_path / "broken.jpg", (60, 40))], CameraConfig())
+
+
+def test_no_images_need_no_cameras():
+    assert make_cameras([], CameraConfig()) == Cameras((), ())
+
+
+# Database
+
+NAMES = ("b 1.jpg", "sub/ü.jpg", "a.jpg")  # not sorted, with a space, a folder and a letter beyond ASCII
+
+
+def write_small_database(path: Path) -> tuple[list[Keypoints], list[IndexMatches]]:
+    images = [ImageRef(name, Path(name), (60, 40)) for name in NAMES]
+    cameras = tuple(
+        pycolmap.Camera.create_from_model_name(camera_id, "SIMPLE_RADIAL", 50.0 + camera_id, 60, 40)
+        for camera_id in (1, 2)
+    )
+    cameras[1].has_prior_focal_length = True
+    keypoints = [make_keypoints(NAMES[0], 5, 0), make_keypoints(NAMES[1], 0), make_keypoints(NAMES[2], 4, 1)]
+    matches = [
+        make_index_matches("a.jpg", "b 1.jpg", [(0, 4), (3, 2), (1, 0)]),
+        make_index_matches("a.jpg", "sub/ü.jpg", []),
+    ]
+    write_database(path, images, Cameras(cameras, (0, 1, 0)), keypoints, matches)
+    return keypoints, matches
+
+
+def test_database_holds_what_was_written(tmp_path):
+    path = tmp_path / "database.db"
+    keypoints, matches = write_small_database(path)
+    assert read_image_ids(path) == {"b 1.jpg": 1, "sub/ü.jpg": 2, "a.jpg": 3}
+    with pycolmap.Database.open(path) as database:
+        for image_id, points in enumerate(keypoints, start=1):
+            stored = database.read_keypoints(image_id)
+            assert stored.dtype == np.float32
+            np.testing.assert_array_equal(stored.reshape(-1, 2), points.xy)
+        # Image a.jpg is image 0 of its pair but has the larger id.
+        np.testing.assert_array_equal(database.read_matches(3, 1), matches[0].indices)
+        np.testing.assert_array_equal(database.read_matches(1, 3), matches[0].indices[:, ::-1])
+        assert database.num_matched_image_pairs() == 1
+        assert database.num_verified_image_pairs() == 0
+        assert [camera.focal_length for camera in database.read_all_cameras()] == [51.0, 52.0]
+        assert [camera.has_prior_focal_length for camera in database.read_all_cameras()] == [False, True]
+
+
+def test_each_camera_has_a_rig_and_each_image_a_frame(tmp_path):
+    path = tmp_path / "database.db"
+    write_small_database(path)
+    with pycolmap.Database.open(path) as database:
+        assert database.num_rigs() == 2
+        assert database.num_frames() == 3
+        for image in database.read_all_images():
+            frame = database.read_frame(image.frame_id)
+            rig = database.read_rig(frame.rig_id)
+            assert [data.id for data in frame.data_ids] == [image.image_id]
+            assert rig.ref_sensor_id.id == image.camera_id == {1: 1, 2: 2, 3: 1}[image.image_id]
+            assert rig.num_sensors() == 1
+
+
+def test_an_earlier_database_and_its_leftovers_are_replaced(tmp_path):
+    path = tmp_path / "database.db"
+    path.write_bytes(b"something else")
+    for ending in ("-wal", "-shm", "-journal"):
+        (tmp_path / f"database.db{ending}").write_bytes(b"stale")
+    write_small_database(path)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["database.db"]
+    assert len(read_image_ids(path)) == 3
+
+
+def test_a_failed_write_leaves_the_earlier_database(tmp_path):
+    path = tmp_path / "database.db"
+    write_small_database(path)
+    before = path.read_bytes()
+    images = [ImageRef("a.jpg", Path("a.jpg"), (60, 40))] * 2  # names must be unique
+    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 60, 40)
+    with pytest.raises(Exception, match="(?i)unique|constraint"):
+        write_database(path, images, Cameras((camera,), (0, 0)), [make_keypoints("a.jpg", 2)] * 2, [])
+    assert path.read_bytes() == before
+    assert [entry.name for entry in tmp_path.iterdir()] == ["database.db"]
+
+
+@pytest.mark.parametrize(
+    ("name1", "indices", "message"),
+    [("c.jpg", [(0, 0)], "not in the collection: 'c.jpg'"), ("b.jpg", [(0, 2)], "beyond the 2 keypoints of 'b.jpg'")],
+)
+def test_matches_that_do_not_fit_the_keypoints_are_refused(tmp_path, name1, indices, message):
+    images = [ImageRef(name, Path(name), (60, 40)) for name in ("a.jpg", "b.jpg")]
+    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 60, 40)
+    keypoints = [make_keypoints("a.jpg", 3), make_keypoints("b.jpg", 2)]
+    matches = [make_index_matches("a.jpg", name1, indices)]
+    with pytest.raises(ValueError, match=message):
+        write_database(tmp_path / "d.db", images, Cameras((camera,), (0, 0)), keypoints, matches)
+    assert not list(tmp_path.iterdir())
+
+
+def test_keypoints_in_another_order_than_the_images_are_refused(tmp_path):
+    images = [ImageRef("a.jpg", Path("a.jpg"), (60, 40)), ImageRef("b.jpg", Path("b.jpg"), (60, 40))]
+    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 60, 40)
+    keypoints = [make_keypoints("b.jpg", 2), make_keypoints("a.jpg", 2)]
+    with pytest.raises(ValueError, match="a.jpg"):
+        write_database(tmp_path / "d.db", images, Cameras((camera,), (0, 0)), keypoints, [])
+    with pytest.raises(ValueError, match="2 images"):
+        write_database(tmp_path / "d.db", images, Cameras((camera,), (0, 0)), keypoints[:1], [])
+
+
+def test_reading_ids_of_a_missing_database_does_not_create_it(tmp_path):
+    with pytest.raises(InputError, match="missing.db"):
+        read_image_ids(tmp_path / "missing.db")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,343 @@
+"""What hm_sfm.mapping makes of oracle scenes: cameras, points and keypoints known, matches exact or planted wrong."""
+
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from hm_sfm.config import MappingConfig, VerificationConfig
+from hm_sfm.database import Cameras, read_image_ids, write_database
+from hm_sfm.errors import InputError
+from hm_sfm.mapping import map_incrementally, summarise_models, verify_database, verify_pair, verify_pairs
+from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, PairMatches
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """A synthetic scene in our types, and the model that it came from."""
+
+    model: pycolmap.Reconstruction
+    images: list[ImageRef]
+    keypoints: list[Keypoints]
+    matches: list[IndexMatches]
+
+
+def make_oracle(folder: Path, num_images: int, num_points: int, prefix: str = "", seed: int = 1) -> Oracle:
+    """A scene of pycolmap's: keypoints and matches are read from its database and renamed to prefix + name."""
+    pycolmap.set_random_seed(seed)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_frames_per_rig=num_images, num_points3D=num_points, num_points2D_without_point3D=3
+    )
+    with pycolmap.Database.open(folder / f"oracle{seed}.db") as database:
+        model = pycolmap.synthesize_dataset(options, database)
+        rows = {row.image_id: prefix + row.name for row in database.read_all_images()}
+        keypoints = []
+        for image_id, name in rows.items():
+            xy = database.read_keypoints(image_id)[:, :2]
+            keypoints.append(Keypoints(name, xy, np.ones(len(xy)), np.ones(len(xy))))
+        matches = []
+        for pair_id, indices in zip(*database.read_all_matches()):
+            id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
+            if rows[id0] > rows[id1]:
+                id0, id1, indices = id1, id0, indices[:, ::-1]
+            matches.append(IndexMatches(ImagePair(rows[id0], rows[id1]), indices, np.ones(len(indices))))
+    camera = next(iter(model.cameras.values()))
+    images = [ImageRef(name, Path(name), (camera.width, camera.height)) for name in rows.values()]
+    return Oracle(model, images, keypoints, matches)
+
+
+@pytest.fixture(scope="module")
+def oracle(tmp_path_factory) -> Oracle:
+    return make_oracle(tmp_path_factory.mktemp("oracle"), num_images=6, num_points=150)
+
+
+def make_known_camera(oracle: Oracle) -> pycolmap.Camera:
+    camera = pycolmap.Camera(next(iter(oracle.model.cameras.values())).todict())
+    camera.camera_id = 1
+    camera.has_prior_focal_length = True
+    return camera
+
+
+def make_unknown_camera(oracle: Oracle) -> pycolmap.Camera:
+    """COLMAP's guess: 4 % off the true focal length, and no distortion."""
+    width, height = oracle.images[0].size_wh
+    return pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1.2 * max(width, height), width, height)
+
+
+def write_and_verify(folder: Path, oracle: Oracle, camera: pycolmap.Camera) -> Path:
+    path = folder / "database.db"
+    write_database(path, oracle.images, Cameras((camera,), (0,) * len(oracle.images)), oracle.keypoints, oracle.matches)
+    verify_database(path, max_error_px=3.0, min_inliers=30, min_inlier_ratio=0.25, num_threads=1)
+    return path
+
+
+def assert_same_up_to_similarity(model: pycolmap.Reconstruction, expected: pycolmap.Reconstruction) -> None:
+    errors = pycolmap.compare_reconstructions(
+        model, expected, alignment_error="proj_center", max_proj_center_error=0.05
+    )["errors"]
+    assert len(errors) == expected.num_reg_images()
+    assert max(error.rotation_error_deg for error in errors) < 0.01
+    assert max(error.proj_center_error for error in errors) < 1e-3
+
+
+# Mapping
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["known-intrinsics", "unknown-intrinsics"])
+def test_model_equals_the_oracle(tmp_path, oracle, known):
+    camera = make_known_camera(oracle) if known else make_unknown_camera(oracle)
+    path = write_and_verify(tmp_path, oracle, camera)
+    registered = []
+    models = map_incrementally(
+        path, tmp_path, tmp_path / "sparse", MappingConfig(), known, on_image=lambda: registered.append(1)
+    )
+    assert len(models) == 1
+    assert_same_up_to_similarity(models[0], oracle.model)
+    assert len(registered) == 6
+    params = models[0].cameras[1].params
+    if known:
+        np.testing.assert_array_equal(params, camera.params)
+    np.testing.assert_allclose(params, next(iter(oracle.model.cameras.values())).params, rtol=1e-3)
+
+    result = summarise_models(models, num_images=8)
+    assert (result.num_images, result.registered, result.points) == (8, 6, models[0].num_points3D())
+    assert result.points >= 140
+    assert result.observations == models[0].compute_num_observations()
+    assert result.mean_track_length == pytest.approx(result.observations / result.points)
+    assert result.mean_reprojection_px < 0.01
+
+
+def test_intrinsics_stay_as_given_even_where_they_are_wrong(tmp_path, oracle):
+    camera = make_known_camera(oracle)
+    camera.focal_length *= 1.002
+    path = write_and_verify(tmp_path, oracle, camera)
+    fixed = map_incrementally(path, tmp_path, tmp_path / "fixed", MappingConfig(), fix_intrinsics=True)
+    free = map_incrementally(path, tmp_path, tmp_path / "free", MappingConfig(), fix_intrinsics=False)
+    np.testing.assert_array_equal(fixed[0].cameras[1].params, camera.params)
+    assert abs(free[0].cameras[1].focal_length - camera.focal_length) > 1.0
+
+
+def test_disjoint_scenes_give_two_models_largest_first(tmp_path):
+    # The smaller scene has more points: the mapper starts there, so its own order is the wrong one.
+    small = make_oracle(tmp_path, num_images=4, num_points=260, prefix="small/", seed=2)
+    large = make_oracle(tmp_path, num_images=6, num_points=130, prefix="large/", seed=3)
+    both = Oracle(
+        large.model, small.images + large.images, small.keypoints + large.keypoints, small.matches + large.matches
+    )
+    path = write_and_verify(tmp_path, both, make_known_camera(large))
+    sparse = tmp_path / "sparse"
+    (sparse / "7").mkdir(parents=True)  # of an earlier run
+    models = map_incrementally(path, tmp_path, sparse, MappingConfig(), fix_intrinsics=True)
+    names = [{image.name.split("/")[0] for image in model.images.values()} for model in models]
+    assert names == [{"large"}, {"small"}]
+    assert [model.num_reg_images() for model in models] == [6, 4]
+    assert sorted(folder.name for folder in sparse.iterdir()) == ["0", "1"]
+    for number, model in enumerate(models):
+        stored = pycolmap.Reconstruction(sparse / str(number))
+        assert stored.num_reg_images() == model.num_reg_images()
+        assert stored.num_points3D() == model.num_points3D()
+
+
+@pytest.mark.parametrize("with_matches", [False, True], ids=["no-matches", "unverified"])
+def test_nothing_to_map_gives_no_model(tmp_path, oracle, with_matches):
+    path = tmp_path / "database.db"
+    matches = oracle.matches if with_matches else []
+    camera = make_known_camera(oracle)
+    write_database(path, oracle.images, Cameras((camera,), (0,) * 6), oracle.keypoints, matches)
+    if not with_matches:
+        verify_database(path, 3.0, 30, 0.25)
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    assert map_incrementally(path, tmp_path, tmp_path / "sparse", MappingConfig(), False) == ()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["database.db"]
+
+    result = summarise_models((), num_images=6)
+    assert (result.models, result.num_images, result.registered, result.points) == ((), 6, 0, 0)
+    assert (result.mean_track_length, result.mean_reprojection_px) == (0.0, 0.0)
+
+
+def test_ctrl_c_leaves_the_earlier_models_and_nothing_else(tmp_path, oracle):
+    path = write_and_verify(tmp_path, oracle, make_known_camera(oracle))
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    registered = []
+
+    def interrupt() -> None:
+        registered.append(1)
+        signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        map_incrementally(path, tmp_path, tmp_path / "sparse", MappingConfig(), True, on_image=interrupt)
+    assert len(registered) == 1
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["database.db", "sparse"]
+    assert (tmp_path / "sparse" / "0").is_dir()
+
+
+def test_colmap_keeps_quiet_below_warnings(tmp_path, oracle, capfd):
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.info("a message to see that messages are captured")
+    path = write_and_verify(tmp_path, oracle, make_known_camera(oracle))
+    map_incrementally(path, tmp_path, tmp_path / "sparse", MappingConfig(), True)
+    lines = "".join(capfd.readouterr()).splitlines()
+    assert [line for line in lines if line.startswith("I2")] == lines[:1]
+    assert any("Could not read image" in line for line in lines)  # a warning, as there are no photos for the colours
+    assert pycolmap.logging.minloglevel == level
+
+
+def test_missing_database_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="missing.db"):
+        verify_database(tmp_path / "missing.db", 3.0, 30, 0.25)
+    with pytest.raises(InputError, match="missing.db"):
+        map_incrementally(tmp_path / "missing.db", tmp_path, tmp_path / "sparse", MappingConfig(), False)
+    assert not list(tmp_path.iterdir())
+
+
+def test_verification_replaces_earlier_geometries_and_drops_planted_outliers(tmp_path, oracle):
+    path = write_and_verify(tmp_path, oracle, make_known_camera(oracle))
+    first = oracle.matches[0]
+    image_ids = read_image_ids(path)
+    id0, id1 = image_ids[first.pair.name0], image_ids[first.pair.name1]
+    wrong = first.indices.copy()
+    wrong[:20, 1] = np.roll(wrong[:20, 1], 7)
+    with pycolmap.Database.open(path) as database:
+        database.delete_matches(id0, id1)
+        database.write_matches(id0, id1, wrong)
+    verify_database(path, 1.0, 30, 0.25, num_threads=1)
+    with pycolmap.Database.open(path) as database:
+        inliers = {tuple(row) for row in database.read_two_view_geometry(id0, id1).inlier_matches.tolist()}
+    assert {tuple(row) for row in wrong[20:].tolist()} <= inliers
+    assert len(inliers & {tuple(row) for row in wrong[:20].tolist()}) <= 2  # a wrong one may lie on its epipolar line
+
+    verify_database(path, 1.0, min_inliers=10_000, min_inlier_ratio=0.25, num_threads=1)
+    with pycolmap.Database.open(path) as database:
+        assert database.num_inlier_matches() == 0
+    assert map_incrementally(path, tmp_path, tmp_path / "sparse", MappingConfig(), True) == ()
+
+
+def test_track_length_counts_distinct_images(oracle):
+    model = pycolmap.Reconstruction(oracle.model)
+    before = summarise_models([model], 6)
+    image = model.images[min(model.images)]
+    spare = next(index for index, point in enumerate(image.points2D) if not point.has_point3D())
+    seen = next(point.point3D_id for point in image.points2D if point.has_point3D())
+    model.add_observation(seen, pycolmap.TrackElement(image.image_id, spare))
+    after = summarise_models([model], 6)
+    assert after.observations == before.observations + 1
+    assert after.mean_track_length == before.mean_track_length > 2
+
+
+# Verification of one pair
+
+SIZE_WH = (1024, 768)
+
+
+def make_matches(xy0: np.ndarray, xy1: np.ndarray, name0: str = "a.jpg", name1: str = "b.jpg") -> PairMatches:
+    return PairMatches(
+        pair=ImagePair(name0, name1),
+        xy0=xy0,
+        xy1=xy1,
+        score=np.ones(len(xy0)),
+        homography=np.tile(np.eye(3), (len(xy0), 1, 1)),
+        patch_radius_px=8.0,
+    )
+
+
+def make_pair(
+    num_matches: int, wrong_part: float, prior: bool, shape: str = "deep"
+) -> tuple[PairMatches, pycolmap.Camera, np.ndarray]:
+    """Exact matches of two cameras side by side, some moved far off their (level) epipolar lines.
+
+    They are moved in both axes: on a plane, matches that were all moved in one direction would fit an epipolar
+    geometry of their own.
+
+    Returns the matches, the camera of both images, and (M,) bool: which are right.
+    """
+    rng = np.random.default_rng(0)
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 1000.0, *SIZE_WH)
+    camera.params = [1000.0, 512.0, 384.0, -0.05]
+    camera.has_prior_focal_length = prior
+    xy0 = rng.uniform((150, 20), (1004, 748), (num_matches, 2))
+    rays = np.column_stack([camera.cam_from_img(xy0), np.ones(num_matches)])
+    depth = rng.uniform(4, 9, num_matches) if shape == "deep" else np.full(num_matches, 5.0)
+    shift = 0.0 if shape == "turning" else 0.6
+    angle = 0.1
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    xy1 = camera.img_from_cam((rays * depth[:, None]) @ turn.T - [shift, 0, 0])
+    right = rng.random(num_matches) >= wrong_part
+    moved = ((~right).sum(), 2)
+    xy1[~right] += rng.choice([-1, 1], moved) * rng.uniform(25, 90, moved)
+    return make_matches(xy0, xy1), camera, right
+
+
+@pytest.mark.parametrize("prior", [True, False], ids=["calibrated", "uncalibrated"])
+@pytest.mark.parametrize("shape", ["deep", "planar", "turning"])
+@pytest.mark.parametrize("num_matches", [200, 3000])
+def test_planted_outliers_are_found(num_matches, shape, prior):
+    # Exact where one geometry alone can fit. An essential matrix that only a plane determines is free to take in a few
+    # wrong matches, and a fundamental matrix or a homography fits distorted images only roughly.
+    tolerance = 0.0 if prior and shape == "deep" else 0.04
+    pair, camera, right = make_pair(num_matches, 0.3, prior, shape)
+    mask = verify_pair(pair, camera, camera, 3.0, 30, 0.25)
+    assert mask.shape == (num_matches,) and mask.dtype == bool
+    assert np.mean(mask != right) <= tolerance
+    np.testing.assert_array_equal(mask, verify_pair(pair, camera, camera, 3.0, 30, 0.25))
+
+
+def test_a_dominant_plane_does_not_cost_what_stands_before_it():
+    planar, camera, _ = make_pair(400, 0.0, True, "planar")
+    deep, _, _ = make_pair(40, 0.0, True, "deep")
+    both = make_matches(np.concatenate([planar.xy0, deep.xy0]), np.concatenate([planar.xy1, deep.xy1]))
+    assert verify_pair(both, camera, camera, 1.0, 30, 0.25).all()
+
+
+def test_pairs_below_the_limits_are_rejected():
+    pair, camera, right = make_pair(200, 0.3, True)
+    count = int(right.sum())
+    assert verify_pair(pair, camera, camera, 3.0, count, count / 200).sum() == count
+    assert not verify_pair(pair, camera, camera, 3.0, count + 1, 0.25).any()
+    assert not verify_pair(pair, camera, camera, 3.0, 30, (count + 1) / 200).any()
+
+
+def test_random_matches_are_rejected():
+    rng = np.random.default_rng(0)
+    _, camera, _ = make_pair(10, 0.0, True)
+    matches = make_matches(*rng.uniform((0, 0), SIZE_WH, (2, 500, 2)))
+    assert not verify_pair(matches, camera, camera, 3.0, 30, 0.25).any()
+
+
+@pytest.mark.parametrize("count", [0, 1, 7])
+def test_too_few_matches_are_rejected(count):
+    pair, camera, _ = make_pair(count, 0.0, True)
+    mask = verify_pair(pair, camera, camera, 3.0, 0, 0.0)
+    assert mask.shape == (count,) and not mask.any()
+
+
+def test_many_pairs_keep_those_that_agree_with_spread_inliers_as_the_strongest():
+    spread, camera, right = make_pair(400, 0.3, True)
+    # As many inliers, but all within one corner of image 0.
+    corner, _, _ = make_pair(4000, 0.0, True)
+    chosen = np.flatnonzero((corner.xy0[:, 0] > 700) & (corner.xy0[:, 1] > 500))[: right.sum()]
+    images = [ImageRef(name, Path(name), SIZE_WH) for name in ("a.jpg", "b.jpg", "c.jpg")]
+    stored = {
+        found.pair: found
+        for found in (
+            spread,
+            make_matches(corner.xy0[chosen], corner.xy1[chosen], "a.jpg", "c.jpg"),
+            make_matches(spread.xy0, spread.xy1[::-1], "b.jpg", "c.jpg"),
+        )
+    }
+    cameras = dict.fromkeys(("a.jpg", "b.jpg", "c.jpg"), camera)
+    # The limit is 3 px of an image that was reduced to a tenth: 30 px, far enough for some of the wrong matches.
+    reduced = {"a.jpg": 1.0, "b.jpg": 10.0, "c.jpg": 1.0}
+    config = VerificationConfig()
+    verified = verify_pairs(images, list(stored), stored.get, cameras, dict.fromkeys(cameras, 1.0), config, quiet=True)
+    assert list(verified) == [ImagePair("a.jpg", "b.jpg"), ImagePair("a.jpg", "c.jpg")]
+    np.testing.assert_array_equal(verified[spread.pair].inliers, right)
+    assert verified[ImagePair("a.jpg", "c.jpg")].strength < verified[spread.pair].strength <= right.sum()
+    loose = verify_pairs(images, [spread.pair], stored.get, cameras, reduced, config, quiet=True)
+    assert loose[spread.pair].inliers.sum() > right.sum()
+
+
+def test_no_pairs_verify_to_nothing():
+    assert verify_pairs([], [], None, {}, {}, VerificationConfig(), quiet=True) == {}

@@ -1,0 +1,198 @@
+"""The fine stage: fine patches around coarse matches -> one homography and one error scale per patch.
+
+Patch coordinates are those of homography.py: cells of the 1/2 grid relative to the patch centre.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from hm_sfm.network.homography import apply_homography, homography_from_corners, make_patch_grid
+
+
+@dataclass(frozen=True)
+class FineEstimate:
+    """What a head says about P patches after one iteration (the last one is the result)."""
+
+    displacement: Tensor
+    """(P, 4, 2) cells: the four corners' displacements."""
+    homography: Tensor
+    """(P, 3, 3): cells of patch A -> cells of patch B."""
+    log_scale: Tensor
+    """(P,): log of the expected error (Laplace scale), cells."""
+
+
+def gather_patches(fine: Tensor, image_index: Tensor, centre: Tensor, side: int) -> Tensor:
+    """Cut square patches out of fine features; cells outside the map are zero.
+
+    fine: (B, C, H, W); image_index: (P,) int64; centre: (P, 2) int64 cells (x, y); side: odd.
+    Returns (P, side * side, C), row by row.
+    """
+    half = side // 2
+    channels, height, width = fine.shape[1:]
+    # Centres off the map see zeros only, whatever their distance: clamping bounds the padding.
+    x = centre[:, 0].clamp(-half - 1, width + half)
+    y = centre[:, 1].clamp(-half - 1, height + half)
+    pad = side
+    padded = F.pad(fine.permute(0, 2, 3, 1), (0, 0, pad, pad, pad, pad))
+    padded_height, padded_width = padded.shape[1:3]
+    offsets = torch.arange(-half, half + 1, device=fine.device)
+    rows = (image_index * padded_height + y + pad)[:, None] + offsets
+    columns = (x + pad)[:, None] + offsets
+    index = rows[:, :, None] * padded_width + columns[:, None, :]
+    return padded.reshape(-1, channels)[index.reshape(-1)].view(len(centre), side * side, channels)
+
+
+def correlate_patches(patch0: Tensor, patch1: Tensor) -> Tensor:
+    """C of the paper (section 3.2): ReLU of scaled inner products.
+
+    patch0: (P, N0, C), patch1: (P, N1, C). Returns (P, N0, N1).
+    """
+    return F.relu(torch.bmm(patch0, patch1.transpose(1, 2)) * patch0.shape[-1] ** -0.5)
+
+
+def sample_windows(maps: Tensor, centre: Tensor, radius: int) -> Tensor:
+    """Bilinear samples of correlation maps on square windows; zero outside the maps.
+
+    maps: (P, N, S * S + 1), row by row, and a last entry of zero that stands for all cells outside; centre:
+    (P, N, 2) real-valued map indices (x, y), without gradient. Returns ((2 * radius + 1)**2, P * N), windows row by
+    row. All samples of a window share one sub-cell shift, so a window needs (2 * radius + 2)**2 look-ups, not four
+    per sample; the windows' offsets come first so that every operation runs over long contiguous rows.
+    """
+    cells = maps.shape[2]
+    side = math.isqrt(cells - 1)
+    centre = centre.reshape(-1, 2).T
+    low = centre.floor()
+    x_shift, y_shift = (centre - low).to(maps.dtype)
+    steps = torch.arange(-radius, radius + 2, device=maps.device, dtype=torch.int32)
+    x, y = low.to(torch.int32)[:, None] + steps[:, None]
+    # Out of range in either direction, the sum is at least `cells`, and clamps to the entry of zero.
+    x = torch.where((x >= 0) & (x < side), x, cells)
+    y = torch.where((y >= 0) & (y < side), y * side, cells)
+    index = (y[:, None] + x).clamp_max_(cells - 1)
+    values = maps.view(-1, cells).gather(1, index.flatten(0, 1).T.long()).T.contiguous().view(index.shape)
+    rows = torch.lerp(values[:-1], values[1:], y_shift)
+    return torch.lerp(rows[:, :-1], rows[:, 1:], x_shift).flatten(0, 1)
+
+
+def make_pooling(side: int) -> Tensor:
+    """(S * S + 1, H * H + 1) float32: times maps of layout sample_windows it halves them, H = ceil(S / 2).
+
+    Average pool of stride 2, as the matrix product that it is: several times faster on small maps. Odd sides are
+    padded by zeros. Cell k of the result sits at index 2 k + 0.5 of the input.
+    """
+    half_side = (side + 1) // 2
+    y, x = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
+    pooling = torch.zeros(side * side + 1, half_side * half_side + 1)
+    pooling[torch.arange(side * side), (y // 2 * half_side + x // 2).flatten()] = 0.25
+    return pooling
+
+
+class HomographyHead(nn.Module):
+    """The paper's fine module (section 3.2): K residual updates of the corner displacements.
+
+    window: w, side of the patch of A, 2**n + 1. margin: cells by which the patch of B is larger on each side (the
+    paper: 0), so that points moved beyond w x w still see features. radius: r of the sampled windows.
+    """
+
+    def __init__(self, window: int, radius: int, iterations: int, margin: int) -> None:
+        super().__init__()
+        if window < 5 or (window - 1) & (window - 2):
+            raise ValueError(f"window must be 5, 9, 17 ..., got {window}")
+        self.window, self.radius, self.iterations, self.margin = window, radius, iterations, margin
+        channels = 2 * (2 * radius + 1) ** 2 + 4
+        layers: list[nn.Module] = [nn.Conv2d(channels, 64, 3, padding=1), nn.ReLU(inplace=True)]
+        width, side = 64, window
+        while side > 3:
+            layers += [nn.Conv2d(width, width + 32, 3, stride=2, padding=1), nn.ReLU(inplace=True)]
+            width, side = width + 32, (side + 1) // 2
+        self.encoder = nn.Sequential(*layers)
+        self.corners = nn.Conv2d(width, 2, 2)
+        self.scale = nn.Conv2d(width, 1, 3)
+        for layer in (self.corners, self.scale):
+            nn.init.normal_(layer.weight, std=1e-3)
+            nn.init.zeros_(layer.bias)
+        self.register_buffer("grid", make_patch_grid((window - 1) / 2), persistent=False)
+        self.register_buffer("pooling", make_pooling(window + 2 * margin), persistent=False)
+
+    @property
+    def half(self) -> float:
+        """Distance of a patch's corner cells from its centre along each axis, cells."""
+        return (self.window - 1) / 2
+
+    def forward(self, fine0: Tensor, fine1: Tensor, image_index: Tensor, cell0: Tensor, cell1: Tensor) -> list:
+        """Homographies from the patch around cell0 of fine0 to the patch around cell1 of fine1.
+
+        fine0, fine1: (B, C, H, W); image_index: (P,) int64; cell0, cell1: (P, 2) int64, cells of the 1/2 grid.
+        Returns the FineEstimate of each iteration.
+        """
+        patch0 = gather_patches(fine0, image_index, cell0, self.window)
+        patch1 = gather_patches(fine1, image_index, cell1, self.window + 2 * self.margin)
+        # A last row of zero features makes the zero that sample_windows takes outside the maps.
+        full = correlate_patches(patch0, F.pad(patch1, (0, 0, 0, 1)))
+        pooled = full @ self.pooling.to(full.dtype)
+        displacement = full.new_zeros((len(cell0), 4, 2), dtype=torch.float32)
+        estimates = []
+        for _ in range(self.iterations):
+            displacement = displacement.detach()
+            with torch.no_grad():
+                target = apply_homography(homography_from_corners(displacement, self.half), self.grid)
+            residual, log_scale = self.decode(full, pooled, target)
+            displacement = displacement + residual
+            homography = homography_from_corners(displacement, self.half)
+            estimates.append(FineEstimate(displacement, homography, log_scale))
+        return estimates
+
+    def decode(self, full: Tensor, pooled: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """One update: what the correlations around `target` (P, N, 2) say. Returns (P, 4, 2) cells and (P,)."""
+        index = target + self.half + self.margin
+        shift = (target - self.grid) / self.half
+        grid = (self.grid / self.half).expand_as(shift)
+        samples = torch.cat(
+            [
+                sample_windows(full, index, self.radius),
+                sample_windows(pooled, (index - 0.5) / 2, self.radius),
+                shift.reshape(-1, 2).T.to(full.dtype),
+                grid.reshape(-1, 2).T.to(full.dtype),
+            ]
+        )
+        maps = samples.T.reshape(len(target), self.window, self.window, -1).permute(0, 3, 1, 2)
+        code = self.encoder(maps)
+        # A bounded step: unbounded ones fold patches over early in training, and never recover.
+        residual = self.half * torch.tanh(self.corners(code).float())
+        log_scale = self.scale(code).float().flatten().clamp(-5.0, 5.0)
+        return residual.flatten(2).transpose(1, 2), log_scale
+
+
+class ExpectationHead(nn.Module):
+    """LoFTR's point-to-patch head, the baseline: the expected position of A's centre cell in B's patch.
+
+    The homography is the plain shift to it; the error scale is the spread of the distribution.
+    """
+
+    def __init__(self, window: int, margin: int) -> None:
+        super().__init__()
+        self.window, self.margin = window, margin
+        half1 = (window - 1) / 2 + margin
+        self.register_buffer("positions", make_patch_grid(half1), persistent=False)
+
+    @property
+    def half(self) -> float:
+        """As in HomographyHead."""
+        return (self.window - 1) / 2
+
+    def forward(self, fine0: Tensor, fine1: Tensor, image_index: Tensor, cell0: Tensor, cell1: Tensor) -> list:
+        """As HomographyHead.forward; a list of one FineEstimate."""
+        patch0 = gather_patches(fine0, image_index, cell0, 1)
+        patch1 = gather_patches(fine1, image_index, cell1, self.window + 2 * self.margin)
+        logits = torch.bmm(patch0, patch1.transpose(1, 2)).float() * patch0.shape[-1] ** -0.5
+        heatmap = logits.squeeze(1).softmax(dim=1)
+        weighted = heatmap[..., None] * self.positions
+        shift = weighted.sum(dim=1)
+        variance = (weighted * self.positions).sum(dim=1) - shift.square()
+        log_scale = 0.5 * variance.sum(dim=1).clamp_min(1e-6).log()
+        displacement = shift[:, None].expand(-1, 4, -1)
+        return [FineEstimate(displacement, homography_from_corners(displacement, self.half), log_scale)]

@@ -1,0 +1,269 @@
+"""The network as a whole, its weights files, and HomoMatcher: two images in, PatchMatches out."""
+
+import dataclasses
+import hashlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, parse_config
+from hm_sfm.coordinates import Grid
+from hm_sfm.errors import ConfigError, WeightsError
+from hm_sfm.images import PreparedImage, prepare_array, prepare_image, read_ref
+from hm_sfm.network.backbone import LightBackbone
+from hm_sfm.network.coarse import match_cells
+from hm_sfm.network.fine import ExpectationHead, FineEstimate, HomographyHead
+from hm_sfm.network.homography import is_regular
+from hm_sfm.types import PatchMatches
+
+WEIGHTS_FOLDER = Path(__file__).parent / "weights"
+FINE_CHUNK = 1024
+"""Patches per call of the fine head: bounds its memory to about 100 MB."""
+
+
+class HomoNet(nn.Module):
+    """Backbone and fine head. The parts are called one by one: features once per image, the head per pair.
+
+    Raises ConfigError where the configuration names no known backbone or head, or an impossible window.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        if config.backbone != "light":
+            raise ConfigError(f"network.backbone must be light, found {config.backbone!r}")
+        self.backbone = LightBackbone()
+        if config.head == "homography":
+            self.head = HomographyHead(config.window, config.radius, config.iterations, config.margin)
+        elif config.head == "expectation":
+            self.head = ExpectationHead(config.window, config.margin)
+        else:
+            raise ConfigError(f"network.head must be homography or expectation, found {config.head!r}")
+
+
+@dataclass(frozen=True)
+class ImageFeatures:
+    """Features of one image, ready to be matched with any other's."""
+
+    coarse: Tensor
+    """(N, C) float32, unit rows: the 1/8 cells whose centre lies in the image."""
+    cell: Tensor
+    """(N, 2) int64: their grid positions (x, y)."""
+    fine: Tensor
+    """(1, C, H/2, W/2)."""
+    scaled_wh: tuple[int, int]
+    stored_from_scaled: np.ndarray
+    """(3, 3) float64: px of the network's input -> px of the stored image."""
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory that the features take."""
+        return sum(t.numel() * t.element_size() for t in (self.coarse, self.cell, self.fine))
+
+
+class HomoMatcher:
+    """Matches two images: a network on a device, with the thresholds of the configuration."""
+
+    def __init__(self, net: HomoNet, config: MatchingConfig, images: ImageConfig) -> None:
+        self.device = pick_device(config.device)
+        self.net = net.to(self.device).eval().requires_grad_(False)
+        self.config, self.images = config, images
+
+    @classmethod
+    def from_pretrained(
+        cls, name: str = "light", *, config: MatchingConfig | None = None, images: ImageConfig | None = None,
+        network: NetworkConfig | None = None,
+    ) -> "HomoMatcher":  # fmt: skip
+        """The matcher with bundled weights (`light`) or those of a file.
+
+        Raises WeightsError where the file is missing, damaged or does not fit `network`.
+        """
+        net = load_weights(name, network)
+        return cls(net, config or MatchingConfig(), images or ImageConfig())
+
+    def match(self, image0: str | Path | np.ndarray, image1: str | Path | np.ndarray) -> PatchMatches:
+        """Match two images, each a path or an HxW or HxWx3 (RGB) uint8 array.
+
+        Coordinates are px of the images as stored. Raises InputError on an unreadable image.
+        """
+        features0, features1 = (self.encode(self._prepare(image)) for image in (image0, image1))
+        return self.match_features(features0, features1)
+
+    def _prepare(self, image: str | Path | np.ndarray) -> PreparedImage:
+        if isinstance(image, np.ndarray):
+            return prepare_array(image, self.images.long_edge_px)
+        return prepare_image(read_ref(Path(image)), self.images.long_edge_px)
+
+    @torch.inference_mode()
+    def encode(self, image: PreparedImage) -> ImageFeatures:
+        """Features of a prepared image."""
+        backbone = self.net.backbone
+        pixels = normalise_image(torch.tensor(image.grey, device=self.device), backbone.stride)
+        with autocast(self.device):
+            maps = backbone(pixels)
+        columns = count_cells(image.scaled_wh[0], backbone.coarse_grid)
+        rows = count_cells(image.scaled_wh[1], backbone.coarse_grid)
+        y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+        return ImageFeatures(
+            coarse=maps.coarse[0, :, :rows, :columns].flatten(1).T.contiguous(),
+            cell=torch.stack([x, y], dim=-1).reshape(-1, 2).to(self.device),
+            fine=maps.fine,
+            scaled_wh=image.scaled_wh,
+            stored_from_scaled=image.stored_from_scaled,
+        )
+
+    @torch.inference_mode()
+    def match_features(self, features0: ImageFeatures, features1: ImageFeatures) -> PatchMatches:
+        """Match two images by their features; coordinates are px of the stored images."""
+        backbone, head = self.net.backbone, self.net.head
+        index0, index1, similarity = match_cells(features0.coarse, features1.coarse, self.config.coarse_threshold)
+        best = similarity.argsort(descending=True, stable=True)[: self.config.max_matches]
+        cell0 = fine_cell_of(features0.cell[index0[best]], backbone.coarse_grid, backbone.fine_grid)
+        cell1 = fine_cell_of(features1.cell[index1[best]], backbone.coarse_grid, backbone.fine_grid)
+        estimates = []
+        for start in range(0, len(cell0), FINE_CHUNK):
+            chunk = slice(start, start + FINE_CHUNK)
+            first_image = torch.zeros(len(cell0[chunk]), dtype=torch.int64, device=self.device)
+            with autocast(self.device):
+                estimates.append(head(features0.fine, features1.fine, first_image, cell0[chunk], cell1[chunk])[-1])
+        homography = torch.cat([torch.zeros(0, 3, 3, device=self.device)] + [e.homography for e in estimates])
+        log_scale = torch.cat([torch.zeros(0, device=self.device)] + [e.log_scale for e in estimates])
+        regular = is_regular(homography, head.half).cpu().numpy()
+        return self._to_stored(features0, features1, cell0, cell1, homography, log_scale, regular)
+
+    def _to_stored(self, features0, features1, cell0, cell1, homography, log_scale, regular) -> PatchMatches:
+        """From patch coordinates to px of the stored images; drops irregular patches and those out of image 1."""
+        grid, half = self.net.backbone.fine_grid, self.net.head.half
+        stored0 = features0.stored_from_scaled @ cell_to_px(cell0.cpu().numpy(), grid)
+        stored1 = features1.stored_from_scaled @ cell_to_px(cell1.cpu().numpy(), grid)
+        between = stored1 @ homography.cpu().numpy().astype(np.float64) @ np.linalg.inv(stored0)
+        centre0 = stored0[:, :2, 2]
+        mapped = np.einsum("nij,nj->ni", between[:, :, :2], centre0) + between[:, :, 2]
+        between = between / mapped[:, 2, None, None]
+        centre1 = mapped[:, :2] / mapped[:, 2:]
+        stored_corner = features1.stored_from_scaled @ np.array([*features1.scaled_wh, 1.0])
+        stored_origin = features1.stored_from_scaled @ np.array([0.0, 0.0, 1.0])
+        low, high = np.minimum(stored_origin, stored_corner)[:2], np.maximum(stored_origin, stored_corner)[:2]
+        score = score_from_scale(log_scale.cpu().numpy().astype(np.float64), grid)
+        keep = regular & np.all((centre1 >= low) & (centre1 < high), axis=1)
+        keep = keep.nonzero()[0]
+        keep = keep[np.argsort(-score[keep], kind="stable")]
+        px_per_cell = np.sqrt(abs(np.linalg.det(features0.stored_from_scaled[:2, :2]))) * grid.stride
+        return PatchMatches(
+            xy0=centre0[keep],
+            xy1=centre1[keep],
+            score=score[keep],
+            homography=between[keep],
+            patch_radius_px=float(half * px_per_cell),
+        )
+
+
+def normalise_image(grey: Tensor, stride: int) -> Tensor:
+    """(H, W) float32 of any range -> (1, 1, H', W') of zero mean and unit variance, zero-padded right and bottom."""
+    deviation = grey.std().clamp_min(1e-3)
+    height, width = grey.shape
+    padded = grey.new_zeros(1, 1, -(-height // stride) * stride, -(-width // stride) * stride)
+    padded[..., :height, :width] = (grey - grey.mean()) / deviation
+    return padded
+
+
+def count_cells(size_px: int, grid: Grid) -> int:
+    """Cells along an axis whose centre lies within `size_px`."""
+    return int(np.ceil((size_px - grid.offset) / grid.stride))
+
+
+def fine_cell_of(coarse_cell: Tensor, coarse_grid: Grid, fine_grid: Grid) -> Tensor:
+    """(P, 2) int64 coarse cells -> (P, 2) int64: the fine cell nearest to each one's centre (halves go up)."""
+    return torch.floor(fine_grid.from_px(coarse_grid.to_px(coarse_cell.double())) + 0.5).long()
+
+
+def cell_to_px(cell: np.ndarray, grid: Grid) -> np.ndarray:
+    """(P, 2) int64 cells -> (P, 3, 3) float64: patch coordinates around each -> px of the network's input."""
+    matrix = np.zeros((len(cell), 3, 3))
+    matrix[:, 0, 0] = matrix[:, 1, 1] = grid.stride
+    matrix[:, :2, 2] = grid.to_px(cell.astype(np.float64))
+    matrix[:, 2, 2] = 1
+    return matrix
+
+
+def score_from_scale(log_scale: np.ndarray, grid: Grid) -> np.ndarray:
+    """Error scale (P,), log cells -> (P,) in [0, 1]: the probability of an error below 1 px (Laplace)."""
+    return 1 - np.exp(-1 / (np.exp(log_scale) * grid.stride))
+
+
+def autocast(device: torch.device) -> torch.autocast:
+    """Half precision for convolutions and matrix products, where the processor computes it natively."""
+    native = device.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=native)
+
+
+def pick_device(name: str) -> torch.device:
+    """`auto` is CUDA where there is one. Raises ConfigError on an unknown or absent device."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name not in ("cpu", "cuda"):
+        raise ConfigError(f"device must be auto, cpu or cuda, found {name!r}")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device cuda was asked for, but this PyTorch finds no CUDA GPU")
+    return torch.device(name)
+
+
+def save_weights(path: Path, net: HomoNet) -> None:
+    """Write the network's configuration and weights; atomic."""
+    temporary = Path(path).with_name(Path(path).name + ".part")
+    torch.save({"network": dataclasses.asdict(net.config), "state_dict": net.state_dict()}, temporary)
+    os.replace(temporary, path)
+
+
+def find_weights(name: str) -> Path:
+    """The file of bundled weights, or the file that is named. Raises WeightsError where there is neither."""
+    bundled = WEIGHTS_FOLDER / f"{name}.pt"
+    path = bundled if bundled.exists() else Path(name)
+    if not path.is_file():
+        names = ", ".join(sorted(p.stem for p in WEIGHTS_FOLDER.glob("*.pt")))
+        raise WeightsError(f"model {name!r} is neither a file nor bundled weights ({names})")
+    return path
+
+
+def digest_weights(name: str) -> str:
+    """sha256 of a weights file, 64 hex digits. Raises WeightsError where there is none."""
+    return hashlib.sha256(find_weights(name).read_bytes()).hexdigest()
+
+
+def load_weights(name: str, network: NetworkConfig | None = None) -> HomoNet:
+    """The network of bundled weights or of a file, with the number of iterations that `network` asks for.
+
+    Raises WeightsError where the file is missing, damaged, not a weights file, or made for another network.
+    """
+    path = find_weights(name)
+    if path.parent == WEIGHTS_FOLDER:
+        check_digest(path)
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        made_for = parse_config(content["network"], NetworkConfig, str(path))
+        state_dict = content["state_dict"]
+    except Exception as error:
+        raise WeightsError(f"{path} is damaged or no hm_sfm weights file: {' '.join(str(error).split())[:200]}") from error
+    wanted = network or made_for
+    for field in dataclasses.fields(NetworkConfig):
+        found, asked = getattr(made_for, field.name), getattr(wanted, field.name)
+        if field.name != "iterations" and found != asked:
+            raise WeightsError(f"{path} was trained with network.{field.name} {found!r}, the configuration has {asked!r}")
+    net = HomoNet(wanted)
+    try:
+        net.load_state_dict(state_dict)
+    except RuntimeError as error:
+        raise WeightsError(f"{path} does not fit the network: {' '.join(str(error).split())[:300]}") from error
+    return net
+
+
+def check_digest(path: Path) -> None:
+    """Compare bundled weights with the sha256 beside them. Raises WeightsError where they differ."""
+    expected = path.with_suffix(".sha256").read_text().split()[0]
+    found = digest_weights(str(path))
+    if found != expected:
+        raise WeightsError(f"{path} is damaged: its sha256 is {found[:16]}..., expected {expected[:16]}...")

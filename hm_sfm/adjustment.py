@@ -1,0 +1,62 @@
+"""Joint keypoint adjustment: all predictions of a track's keypoints reconciled by robust least squares.
+
+A keypoint that was carried through several pairs has several predictions of its position, each off by the error of
+one homography. Together they pin it down better than any of them.
+"""
+
+import numpy as np
+
+PRIOR_WEIGHT = 0.05
+"""Of each keypoint's first position, relative to one prediction: holds a track where its predictions leave it free."""
+ROUNDS = 15
+STEP = 0.6
+ROBUST_SCALE = 0.5
+"""Residual, in the unit of the coordinates, beyond which a prediction loses weight (Cauchy)."""
+
+
+def adjust_keypoints(
+    xy: np.ndarray, source: np.ndarray, target: np.ndarray, predicted: np.ndarray, jacobian: np.ndarray,
+    weight: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Move keypoints to agree with their links.
+
+    xy: (K, 2) positions; link e says that keypoint target[e] lies at predicted[e] + jacobian[e] (x - xy[source[e]])
+    when its source lies at x: source, target (E,) int64, predicted (E, 2), jacobian (E, 2, 2), weight (E,).
+    Any unit, one for all. Returns the positions (K, 2) float64 and their standard deviations (K,) float64.
+
+    Each round moves every keypoint to the weighted mean of what its links, in both directions, say given the
+    present positions of the others; the weights follow the residuals (iteratively reweighted least squares).
+    """
+    inverse = np.linalg.inv(jacobian)
+    moved = xy.astype(np.float64).copy()
+    count = len(xy)
+    ends = np.concatenate([target, source])
+    links_at = np.bincount(ends, minlength=count)
+    for _ in range(ROUNDS):
+        forward = predict_targets(xy, moved, source, predicted, jacobian)
+        backward = xy[source] + np.einsum("eij,ej->ei", inverse, moved[target] - predicted)
+        residual = np.linalg.norm(forward - moved[target], axis=1)
+        robust = weight / (1 + (residual / ROBUST_SCALE) ** 2)
+        says, trust = np.concatenate([forward, backward]), np.concatenate([robust, robust])
+        total = np.bincount(ends, trust, count) + PRIOR_WEIGHT
+        for axis in range(2):
+            mean = (np.bincount(ends, trust * says[:, axis], count) + PRIOR_WEIGHT * xy[:, axis]) / total
+            # Less than a full step: two linked keypoints that both move to the other's wish would swap for ever.
+            moved[:, axis] += STEP * (mean - moved[:, axis])
+    spread = np.bincount(ends, np.tile(robust * residual**2, 2), count) + PRIOR_WEIGHT * ROBUST_SCALE**2
+    return moved, np.sqrt(spread / total / np.maximum(links_at, 1))
+
+
+def predict_targets(
+    xy: np.ndarray, moved: np.ndarray, source: np.ndarray, predicted: np.ndarray, jacobian: np.ndarray
+) -> np.ndarray:
+    """Where links put their targets, (E, 2), when the sources have moved from xy to `moved`, (K, 2) each."""
+    return predicted + np.einsum("eij,ej->ei", jacobian, moved[source] - xy[source])
+
+
+def measure_residuals(
+    xy: np.ndarray, moved: np.ndarray, source: np.ndarray, target: np.ndarray, predicted: np.ndarray,
+    jacobian: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """(E,) distance between where a link puts its target and where the target is."""
+    return np.linalg.norm(predict_targets(xy, moved, source, predicted, jacobian) - moved[target], axis=1)

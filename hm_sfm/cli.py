@@ -1,0 +1,174 @@
+"""The command hm-sfm."""
+
+import argparse
+import dataclasses
+import json
+import logging
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+from hm_sfm.config import Config, load_config
+from hm_sfm.errors import HmSfmError
+
+EXAMPLES = """examples:
+  hm-sfm demo out/demo                          render a scene, reconstruct it, compare with the truth
+  hm-sfm reconstruct photos out/castle          a folder of photos -> COLMAP model in out/castle/sparse/0
+  hm-sfm export photos out/castle               stop at out/castle/database.db, for COLMAP's GUI or mapper
+  hm-sfm reconstruct photos out/k --camera-model PINHOLE --camera-params 919.8,921.8,507.1,335.9
+
+An interrupted command goes on where it was when it is started again.
+exit codes: 0 done, 2 bad arguments or input, 3 no model could be built, 130 interrupted"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit code."""
+    options = make_parser().parse_args(arguments)
+    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.ERROR if options.quiet else logging.WARNING)
+    try:
+        return options.run(options)
+    except HmSfmError as error:
+        print(f"hm-sfm: {error}", file=sys.stderr)
+        return error.exit_code
+    except OSError as error:
+        print(f"hm-sfm: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("hm-sfm: interrupted; the same command goes on from here", file=sys.stderr)
+        return 130
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """All commands and their options."""
+    parser = argparse.ArgumentParser(
+        prog="hm-sfm",
+        description="3D models from photos: dense matches with homographies, persistent keypoints, COLMAP.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"hm-sfm {version('hm_sfm')}")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    quiet = argparse.ArgumentParser(add_help=False)
+    quiet.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
+
+    for name, run, text in (
+        ("reconstruct", run_reconstruct, "photos -> a COLMAP model in OUT/sparse/0"),
+        ("match", run_match, "photos -> pairs and matches only (OUT/matches.h5)"),
+        ("export", run_export, "photos -> OUT/database.db, verified, for COLMAP's GUI or mapper"),
+    ):
+        command = commands.add_parser(name, parents=[quiet], help=text, description=text)
+        add_photo_options(command)
+        command.set_defaults(run=run)
+
+    text = "render a scene with known cameras, reconstruct it and print the error"
+    command = commands.add_parser("demo", parents=[quiet], help=text, description=text)
+    command.add_argument("out", metavar="OUT", type=Path, help="folder for the photos and the model")
+    command.set_defaults(run=run_demo)
+
+    text = "train the network on a folder of photos"
+    command = commands.add_parser("train", parents=[quiet], help=text, description=text)
+    command.add_argument("--config", type=Path, required=True, help="YAML, for example configs/train_light.yaml")
+    command.add_argument("--resume", action="store_true", help="go on from the last checkpoint, if there is one")
+    add_settings(command)
+    command.set_defaults(run=run_train)
+    return parser
+
+
+def add_photo_options(command: argparse.ArgumentParser) -> None:
+    """The options of all commands that take a folder of photos."""
+    command.add_argument("images", metavar="IMAGES", type=Path, help="folder of photos, searched with its subfolders")
+    command.add_argument("out", metavar="OUT", type=Path, help="folder for everything that is made")
+    command.add_argument("--config", type=Path, help="YAML file (default: as configs/light.yaml)")
+    add_settings(command)
+    for flag, key, text in (
+        ("--pairs", "pairs.mode", "auto, exhaustive, sequential, or a file with two image names a line"),
+        ("--model", "matching.model", "bundled weights (light) or a weights file"),
+        ("--device", "matching.device", "auto, cpu or cuda"),
+        ("--camera-mode", "cameras.mode", "auto, single, per-folder or per-image"),
+        ("--camera-model", "cameras.model", "a COLMAP camera model, for example PINHOLE"),
+        ("--camera-params", "cameras.params", "known intrinsics, f,... as the camera model orders them: kept fixed"),
+    ):
+        command.add_argument(flag, dest=key, metavar=flag[2:].split("-")[-1].upper(), help=text)
+
+
+def add_settings(command: argparse.ArgumentParser) -> None:
+    """--set, for any key of the configuration."""
+    command.add_argument(
+        "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="section.key=value; repeatable"
+    )
+
+
+def read_config(options: argparse.Namespace) -> Config:
+    """The configuration file, then --set, then the options with names of their own."""
+    config = load_config(options.config, tuple(options.settings))
+    for key, value in vars(options).items():
+        if "." in key and value is not None:
+            section, field = key.split(".")
+            part = dataclasses.replace(getattr(config, section), **{field: value})
+            config = dataclasses.replace(config, **{section: part})
+    return config
+
+
+def run_match(options: argparse.Namespace) -> int:
+    from hm_sfm.reconstruction import match_photos
+
+    matched = match_photos(options.images, options.out, read_config(options), options.quiet)
+    print(f"{len(matched.pairs)} pairs of {len(matched.images)} images matched: {options.out / 'matches.h5'}")
+    return 0
+
+
+def run_export(options: argparse.Namespace) -> int:
+    from hm_sfm.reconstruction import export_database
+
+    matched = export_database(options.images, options.out, read_config(options), options.quiet)
+    print(f"{len(matched.images)} images and their keypoints: {options.out / 'database.db'}")
+    return 0
+
+
+def run_reconstruct(options: argparse.Namespace) -> int:
+    from hm_sfm.reconstruction import reconstruct
+
+    reconstruct(options.images, options.out, read_config(options), options.quiet)
+    print_summary(options.out)
+    return 0
+
+
+def run_demo(options: argparse.Namespace) -> int:
+    from hm_sfm.evaluation import read_strecha_cameras, score_model
+    from hm_sfm.reconstruction import claim_folder, reconstruct
+    from hm_sfm.rendering import write_demo
+
+    claim_folder(options.out)
+    write_demo(options.out)
+    result = reconstruct(options.out / "images", options.out, Config(), options.quiet)
+    score = score_model(result.models[0], read_strecha_cameras(options.out / "ground_truth"))
+    print_summary(options.out)
+    print(
+        f"against the truth: AUC@1 deg {score.auc_percent[1]:.1f}, AUC@3 deg {score.auc_percent[3]:.1f}, "
+        f"median rotation error {score.median_rotation_deg:.3f} deg, translation {score.median_translation_deg:.3f} deg"
+    )
+    return 0
+
+
+def run_train(options: argparse.Namespace) -> int:
+    from hm_sfm.training.loop import TrainConfig, train
+
+    weights = train(load_config(options.config, tuple(options.settings), TrainConfig), options.resume, options.quiet)
+    print(f"trained: {weights}")
+    return 0
+
+
+def print_summary(out: Path) -> None:
+    """What summary.json says, in two lines."""
+    summary = json.loads((out / "summary.json").read_text())
+    print(
+        f"{summary['registered']} of {summary['num_images']} images registered, {summary['points']} points, "
+        f"mean track length {summary['mean_track_length']:.2f} images, "
+        f"mean reprojection error {summary['mean_reprojection_px']:.3f} px"
+    )
+    print(f"model: {out / 'sparse' / '0'} ({summary['seconds']['total']:.0f} s)")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,327 @@
+"""Stage 4: persistent keypoints. Verified patch matches carry each keypoint from image to image.
+
+Pairs are walked strongest first. In a pair every keypoint of the first image that lies in a verified patch is carried
+by that patch's homography into the second; every keypoint of the second that is left over is carried back by the
+inverse; patches that hold no keypoint yet seed one at a well-localised pixel. A carried point joins a keypoint that
+is already there, or founds one. Afterwards tracks are formed, adjusted jointly and thinned to the budget.
+
+Coordinates within this module are px of the matching resolution ("units"); results are px of the stored images.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from hm_sfm.adjustment import adjust_keypoints, measure_residuals
+from hm_sfm.config import KeypointConfig
+from hm_sfm.images import PreparedImage
+from hm_sfm.neighbours import find_nearest, find_pairs_within
+from hm_sfm.tracks import label_tracks, measure_lengths
+from hm_sfm.types import ImagePair, IndexMatches, Keypoints, PairMatches, apply_homographies
+
+SEED_CELL_PX = 8
+BUDGET_CELL_PX = 32
+"""The budget of keypoints is spread over square cells of this size."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """What persistence needs to know of an image."""
+
+    name: str
+    size_wh: tuple[int, int]
+    """Px of the stored image."""
+    px_per_unit: float
+    """Px of the stored image per px of the matching resolution."""
+    seeds: np.ndarray
+    """(N, 2) px of the stored image: well-localised points, best first."""
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """The verified patches of a pair in one direction, in units."""
+
+    centre: np.ndarray
+    """(P, 2) in the image that points are carried from."""
+    homography: np.ndarray
+    """(P, 3, 3)."""
+    score: np.ndarray
+    """(P,)."""
+
+
+@dataclass(frozen=True)
+class Carried:
+    """Points that a Carrier could place in the other image."""
+
+    point: np.ndarray
+    """(C,) int64: which of the given points."""
+    target: np.ndarray
+    """(C,) int64: the keypoint it joins, -1 where it founds a new one."""
+    predicted: np.ndarray
+    """(C, 2) units."""
+    jacobian: np.ndarray
+    """(C, 2, 2): how the prediction moves with the point."""
+    score: np.ndarray
+    """(C,)."""
+
+
+@dataclass(frozen=True)
+class Links:
+    """Predictions between the keypoints of two images: target[e] from source[e]."""
+
+    source_image: int
+    target_image: int
+    source: np.ndarray
+    target: np.ndarray
+    """(E,) int64, indices into the two images' keypoints."""
+    carried: Carried
+
+
+class GrowingKeypoints:
+    """The keypoints of one image while pairs are walked: xy (K, 2) units."""
+
+    def __init__(self) -> None:
+        self.xy = np.zeros((0, 2))
+
+    def append(self, xy: np.ndarray) -> np.ndarray:
+        """Add keypoints (N, 2); returns their indices (N,) int64."""
+        first = len(self.xy)
+        self.xy = np.concatenate([self.xy, xy])
+        return np.arange(first, len(self.xy))
+
+    def settle(self, carried: Carried) -> np.ndarray:
+        """The keypoints that carried points end at (C,) int64: joined ones, or new ones that they found."""
+        target = carried.target.copy()
+        target[target < 0] = self.append(carried.predicted[target < 0])
+        return target
+
+
+def find_seeds(image: PreparedImage) -> np.ndarray:
+    """The best-localised pixel (Shi-Tomasi) of each 8 x 8 px cell: (N, 2) float64 px of the stored image, best first."""
+    height, width = image.grey.shape
+    rows, columns = height // SEED_CELL_PX, width // SEED_CELL_PX
+    response = cv2.cornerMinEigenVal(image.grey, blockSize=3, ksize=3)
+    cells = response[: rows * SEED_CELL_PX, : columns * SEED_CELL_PX]
+    cells = cells.reshape(rows, SEED_CELL_PX, columns, SEED_CELL_PX).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
+    best = cells.argmax(axis=2)
+    y = np.arange(rows)[:, None] * SEED_CELL_PX + best // SEED_CELL_PX
+    x = np.arange(columns)[None, :] * SEED_CELL_PX + best % SEED_CELL_PX
+    xy = np.stack([x, y], axis=-1).reshape(-1, 2) + 0.5
+    order = np.argsort(-cells.max(axis=2).ravel(), kind="stable")
+    stored = image.stored_from_scaled
+    return xy[order] @ stored[:2, :2].T + stored[:2, 2]
+
+
+def thin_points(xy: np.ndarray, spacing: float) -> np.ndarray:
+    """(N,) bool: keep points that have no earlier point within `spacing`; xy: (N, 2), best first."""
+    later, earlier, _ = find_pairs_within(xy, xy, spacing)
+    keep = np.ones(len(xy), bool)
+    keep[later[earlier < later]] = False
+    return keep
+
+
+def make_carriers(matches: PairMatches, px_per_unit0: float, px_per_unit1: float) -> tuple[Carrier, Carrier]:
+    """The carriers of verified matches, from image 0 to image 1 and back."""
+    scale0, scale1 = np.diag([px_per_unit0, px_per_unit0, 1.0]), np.diag([px_per_unit1, px_per_unit1, 1.0])
+    forward = np.linalg.inv(scale1) @ matches.homography.astype(np.float64) @ scale0
+    centre0, centre1 = matches.xy0 / px_per_unit0, matches.xy1 / px_per_unit1
+    return Carrier(centre0, forward, matches.score), Carrier(centre1, np.linalg.inv(forward), matches.score)
+
+
+def carry_points(
+    xy: np.ndarray, carrier: Carrier, there_xy: np.ndarray, free: np.ndarray, size_there: np.ndarray,
+    config: KeypointConfig,
+) -> Carried:  # fmt: skip
+    """Place points of one image in the other, one to one with what is there.
+
+    xy: (N, 2) units; there_xy: (K, 2) keypoints of the other image, free (K,) bool: not yet linked in this pair;
+    size_there: (2,) units. A point is carried by the nearest patch centre within carry_radius_px. It joins the free
+    keypoint within join_radius_px where each is the other's nearest; it founds a keypoint where none lies within
+    separation_px, free or not, nor a better-scored founder; otherwise it is dropped.
+    """
+    patch, _ = find_nearest(xy, carrier.centre, config.carry_radius_px)
+    point = np.flatnonzero(patch >= 0)
+    homography = carrier.homography[patch[point]]
+    predicted = apply_homographies(homography, xy[point]).astype(np.float64)
+    inside = np.all((predicted >= 0) & (predicted < size_there), axis=1)
+    point, homography, predicted = point[inside], homography[inside], predicted[inside]
+    score = carrier.score[patch[point]]
+
+    nearest, distance = find_nearest(predicted, there_xy, config.separation_px)
+    # Index -1, no neighbour, meets the appended False.
+    joins = (distance <= config.join_radius_px) & np.append(free, False)[nearest]
+    order = np.lexsort((distance, ~joins))
+    _, first = np.unique(nearest[order], return_index=True)
+    best = np.zeros(len(point), bool)
+    best[order[first]] = True
+    joins &= best
+    founds = np.flatnonzero(nearest < 0)
+    founds = founds[np.argsort(-score[founds], kind="stable")]
+    founds = founds[thin_points(predicted[founds], config.separation_px)]
+    kept = np.sort(np.concatenate([np.flatnonzero(joins), founds]))
+    target = np.where(joins[kept], nearest[kept], -1)
+    jacobian = differentiate(homography[kept], xy[point[kept]])
+    return Carried(point[kept], target, predicted[kept], jacobian, score[kept])
+
+
+def differentiate(homography: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """(N, 2, 2): the derivative of homography i (N, 3, 3) at point i (N, 2)."""
+    ones = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    x, y, w = np.einsum("nij,nj->in", homography, ones)
+    top = homography[:, :2, :2] * w[:, None, None] - np.stack([x, y], 1)[:, :, None] * homography[:, 2:, :2]
+    return top / w[:, None, None] ** 2
+
+
+def persist_keypoints(
+    photos: Sequence[Photo],
+    ranked_pairs: Sequence[ImagePair],
+    read_verified: Callable[[ImagePair], PairMatches],
+    config: KeypointConfig,
+    quiet: bool = False,
+) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
+    """Carry keypoints through all pairs, form tracks, adjust them and thin them out.
+
+    photos: in the order of the result; ranked_pairs: strongest first, the first image of a pair (the one that
+    seeds) is the one in more and stronger pairs; read_verified: the matches of a pair that agree with its two-view
+    geometry. Returns the Keypoints of every image, and the IndexMatches of every pair that shares tracks.
+    """
+    index_of = {photo.name: i for i, photo in enumerate(photos)}
+    growing = [GrowingKeypoints() for _ in photos]
+    seeds = []
+    for photo in photos:
+        units = photo.seeds / photo.px_per_unit
+        seeds.append(units[thin_points(units, config.separation_px)])
+    strength = np.zeros(len(photos))
+    for place, pair in enumerate(ranked_pairs):
+        strength[[index_of[pair.name0], index_of[pair.name1]]] += len(ranked_pairs) - place
+    links: list[Links] = []
+    for pair in tqdm(ranked_pairs, desc="keypoints", unit="pair", disable=quiet):
+        ends = index_of[pair.name0], index_of[pair.name1]
+        carriers = make_carriers(read_verified(pair), *(photos[i].px_per_unit for i in ends))
+        turn = strength[ends[1]] > strength[ends[0]]
+        first, second = ends[::-1] if turn else ends
+        links += walk_pair(first, second, carriers[::-1] if turn else carriers, photos, growing, seeds[first], config)
+    return finish_keypoints(photos, growing, links, config)
+
+
+def walk_pair(
+    first: int, second: int, carriers: tuple[Carrier, Carrier], photos: Sequence[Photo],
+    growing: list[GrowingKeypoints], seeds: np.ndarray, config: KeypointConfig,
+) -> list[Links]:  # fmt: skip
+    """Carry the keypoints of `first` into `second`, those left over in `second` back, then seed; grows both."""
+    here, there = growing[first], growing[second]
+    size_first, size_second = (np.array(photos[i].size_wh) / photos[i].px_per_unit for i in (first, second))
+
+    old_there = len(there.xy)
+    onward = carry_points(here.xy, carriers[0], there.xy, np.ones(old_there, bool), size_second, config)
+    onward_links = Links(first, second, onward.point, there.settle(onward), onward)
+
+    free_here = np.ones(len(here.xy), bool)
+    free_here[onward_links.source] = False
+    left = np.setdiff1d(np.arange(old_there), onward_links.target)
+    back = carry_points(there.xy[left], carriers[1], here.xy, free_here, size_first, config)
+    back_links = Links(second, first, left[back.point], here.settle(back), back)
+
+    covered, _ = find_nearest(seeds, here.xy, config.seed_spacing_px)
+    fresh = seeds[covered < 0]
+    # A seed in first founds its partner in second; one that would join has a neighbour that was carried back.
+    no_partner = np.zeros(len(there.xy), bool)
+    seeded = carry_points(fresh, carriers[0], there.xy, no_partner, size_second, config)
+    seed_links = Links(first, second, here.append(fresh[seeded.point]), there.settle(seeded), seeded)
+    return [onward_links, back_links, seed_links]
+
+
+def finish_keypoints(
+    photos: Sequence[Photo], growing: list[GrowingKeypoints], links: list[Links], config: KeypointConfig
+) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
+    """From links to consistent tracks, adjusted positions, and the keypoints that the budget keeps."""
+    counts = [len(g.xy) for g in growing]
+    start = np.concatenate([[0], np.cumsum(counts)])
+    image = np.repeat(np.arange(len(photos)), counts)
+    xy = np.concatenate([np.zeros((0, 2))] + [g.xy for g in growing])
+    source = np.concatenate([np.zeros(0, np.int64)] + [start[link.source_image] + link.source for link in links])
+    target = np.concatenate([np.zeros(0, np.int64)] + [start[link.target_image] + link.target for link in links])
+    predicted = np.concatenate([np.zeros((0, 2))] + [link.carried.predicted for link in links])
+    jacobian = np.concatenate([np.zeros((0, 2, 2))] + [link.carried.jacobian for link in links])
+    score = np.concatenate([np.zeros(0)] + [link.carried.score for link in links]).astype(np.float64)
+
+    label = label_tracks(len(xy), source, target, score, image)
+    same = label[source] == label[target]
+    moved, sigma = adjust_keypoints(xy, source[same], target[same], predicted[same], jacobian[same], score[same])
+    residual = measure_residuals(xy, moved, source, target, predicted, jacobian)
+    agreed = same & (residual <= config.join_radius_px)
+    label = label_tracks(len(xy), source[agreed], target[agreed], score[agreed], image)
+
+    size = np.array([np.array(photo.size_wh) / photo.px_per_unit for photo in photos]).reshape(-1, 2)
+    inside = np.all((moved >= 0) & (moved < size[image]), axis=1)
+    length = measure_lengths(label)
+    kept = inside & (length >= 2) & choose_budget(label, length, sigma, moved, image, config.max_keypoints)
+    new_index = np.cumsum(kept) - 1
+    kept_start = np.concatenate([[0], np.cumsum(np.bincount(image[kept], minlength=len(photos)))])
+
+    keypoints = []
+    for i, photo in enumerate(photos):
+        mine = kept & (image == i)
+        quality = (length[mine] / len(photos)).clip(0, 1)
+        keypoints.append(
+            Keypoints(photo.name, moved[mine] * photo.px_per_unit, sigma[mine] * photo.px_per_unit, quality)
+        )
+    used = agreed & (label[source] == label[target]) & kept[source] & kept[target]
+    matches = group_matches(photos, image, new_index - kept_start[image], source[used], target[used], score[used])
+    return tuple(keypoints), matches
+
+
+def choose_budget(
+    label: np.ndarray, length: np.ndarray, sigma: np.ndarray, xy: np.ndarray, image: np.ndarray, budget: int
+) -> np.ndarray:
+    """(K,) bool: keypoints whose track at least half of its images choose among their best `budget`.
+
+    Each image takes its longest, then most certain tracks, cell by cell in turns, so that they spread.
+    label, length, sigma, image: (K,); xy: (K, 2) units.
+    """
+    if len(label) == 0:
+        return np.zeros(0, bool)
+    cell = np.floor(xy / BUDGET_CELL_PX).astype(np.int64).clip(-1, 100_000)
+    place = (image * 200_000 + cell[:, 1]) * 200_000 + cell[:, 0]
+    order = np.lexsort((sigma, -length, place))
+    turn = np.empty(len(label), np.int64)
+    turn[order] = rank_in_groups(place[order])
+    # A cell's second-longest track comes before another's single-pair one: turns count less than length.
+    order = np.lexsort((sigma, turn // 4 - length, image))
+    chosen = np.empty(len(label), bool)
+    chosen[order] = rank_in_groups(image[order]) < budget
+    _, track = np.unique(label, return_inverse=True)
+    votes = np.bincount(track, chosen) / np.bincount(track)
+    return votes[track] >= 0.5
+
+
+def rank_in_groups(group: np.ndarray) -> np.ndarray:
+    """(N,) int64: position of each entry within its run of equal values; group: (N,), sorted."""
+    first = np.concatenate([[True], group[1:] != group[:-1]])
+    starts = np.flatnonzero(first)
+    return np.arange(len(group)) - np.repeat(starts, np.diff(np.append(starts, len(group))))
+
+
+def group_matches(
+    photos: Sequence[Photo], image: np.ndarray, index: np.ndarray, source: np.ndarray, target: np.ndarray,
+    score: np.ndarray,
+) -> tuple[IndexMatches, ...]:  # fmt: skip
+    """Links between kept keypoints as IndexMatches per pair of images, each match once."""
+    names = np.array([photo.name for photo in photos], dtype=object)
+    swap = np.array([names[a] > names[b] for a, b in zip(image[source], image[target])], dtype=bool)
+    low, high = np.where(swap, target, source), np.where(swap, source, target)
+    order = np.lexsort((-score, high, low, image[high], image[low]))
+    low, high, score = low[order], high[order], score[order]
+    once = np.ones(len(low), bool)
+    once[1:] = (np.diff(low) != 0) | (np.diff(high) != 0)
+    low, high, score = low[once], high[once], score[once]
+    pair_key = image[low] * len(photos) + image[high]
+    matches = []
+    for rows in np.split(np.arange(len(low)), np.flatnonzero(np.diff(pair_key)) + 1):
+        if len(rows):
+            pair = ImagePair(names[image[low[rows[0]]]], names[image[high[rows[0]]]])
+            matches.append(IndexMatches(pair, np.stack([index[low[rows]], index[high[rows]]], axis=1), score[rows]))
+    return tuple(matches)

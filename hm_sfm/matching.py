@@ -1,0 +1,83 @@
+"""Stage 3: image pairs -> PairMatches, each photo encoded about once, resumable."""
+
+import time
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from tqdm import tqdm
+
+from hm_sfm.images import prepare_image
+from hm_sfm.network.model import HomoMatcher, ImageFeatures
+from hm_sfm.store import MatchStore
+from hm_sfm.types import ImagePair, ImageRef, PairMatches
+
+BATCH_SECONDS = 20.0
+"""Matches are stored at least this often: what a crash can lose."""
+
+
+@dataclass(frozen=True)
+class MatchingTimes:
+    """Seconds spent reading and encoding photos, and matching pairs."""
+
+    features: float
+    match: float
+
+
+class FeatureCache:
+    """Features of the photos used last, up to a limit of memory; photos are encoded on demand."""
+
+    def __init__(self, images: Sequence[ImageRef], matcher: HomoMatcher, limit_mb: int, progress: tqdm) -> None:
+        self.images = {image.name: image for image in images}
+        self.matcher, self.limit_bytes, self.progress = matcher, limit_mb * 1_000_000, progress
+        self.cached: OrderedDict[str, ImageFeatures] = OrderedDict()
+        self.seen: set[str] = set()
+        self.seconds = 0.0
+
+    def get(self, name: str) -> ImageFeatures:
+        """Features of a photo. Raises InputError where it cannot be decoded."""
+        if name in self.cached:
+            self.cached.move_to_end(name)
+            return self.cached[name]
+        started = time.monotonic()
+        prepared = prepare_image(self.images[name], self.matcher.images.long_edge_px)
+        features = self.matcher.encode(prepared)
+        self.cached[name] = features
+        # Two photos are always held: a pair needs both.
+        while len(self.cached) > 2 and sum(f.size_bytes for f in self.cached.values()) > self.limit_bytes:
+            self.cached.popitem(last=False)
+        self.seconds += time.monotonic() - started
+        if name not in self.seen:
+            self.seen.add(name)
+            self.progress.update()
+        return features
+
+
+def match_pairs(
+    images: Sequence[ImageRef], pairs: Sequence[ImagePair], matcher: HomoMatcher, store: MatchStore, quiet: bool = False
+) -> MatchingTimes:
+    """Match the pairs that the store does not hold yet, and store them. Raises InputError on an undecodable photo.
+
+    Interrupted at any moment, what was stored stays; the same call goes on from there.
+    """
+    missing = [pair for pair in pairs if pair not in store]
+    started = stored_at = time.monotonic()
+    names = {name for pair in missing for name in (pair.name0, pair.name1)}
+    batch: list[PairMatches] = []
+    with (
+        tqdm(total=len(names), desc="features", unit="image", disable=quiet or not names) as images_bar,
+        tqdm(total=len(pairs), initial=len(pairs) - len(missing), desc="matches", unit="pair", disable=quiet) as pairs_bar,
+    ):
+        cache = FeatureCache(images, matcher, matcher.config.feature_cache_mb, images_bar)
+        try:
+            for pair in missing:
+                found = matcher.match_features(cache.get(pair.name0), cache.get(pair.name1))
+                batch.append(PairMatches(pair=pair, **vars(found)))
+                pairs_bar.update()
+                if time.monotonic() - stored_at > BATCH_SECONDS:
+                    store.write(batch)
+                    batch, stored_at = [], time.monotonic()
+        finally:
+            store.write(batch)
+    store.merge()
+    return MatchingTimes(features=cache.seconds, match=time.monotonic() - started - cache.seconds)

@@ -1,21 +1,29 @@
 """Structure from Motion from detector-free matches with homographies and persistent keypoints."""
 
-from hm_sfm.config import Config, load_config
-from hm_sfm.network.model import HomoMatcher
-from hm_sfm.reconstruction import export_database, match_photos, reconstruct
-from hm_sfm.types import ImagePair, IndexMatches, Keypoints, PairMatches, PatchMatches, Tracks
+from importlib import import_module
+from typing import Any
 
-__all__ = [
-    "Config",
-    "HomoMatcher",
-    "ImagePair",
-    "IndexMatches",
-    "Keypoints",
-    "PairMatches",
-    "PatchMatches",
-    "Tracks",
-    "export_database",
-    "load_config",
-    "match_photos",
-    "reconstruct",
-]
+_MODULE_OF = {
+    "Config": "config",
+    "HomoMatcher": "network.model",
+    "ImagePair": "types",
+    "IndexMatches": "types",
+    "Keypoints": "types",
+    "MappingResult": "types",
+    "PairMatches": "types",
+    "PatchMatches": "types",
+    "Tracks": "types",
+    "export_database": "reconstruction",
+    "load_config": "config",
+    "match_photos": "reconstruction",
+    "reconstruct": "reconstruction",
+}
+
+__all__ = list(_MODULE_OF)
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first asked for: `hm-sfm --help` need not wait for PyTorch."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)

@@ -8,31 +8,56 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import NoReturn
 
 from hm_sfm.config import Config, load_config
-from hm_sfm.errors import HmSfmError
+from hm_sfm.errors import HmSfmError, InputError
 
 EXAMPLES = """examples:
-  hm-sfm demo out/demo                          render a scene, reconstruct it, compare with the truth
-  hm-sfm reconstruct photos out/castle          a folder of photos -> COLMAP model in out/castle/sparse/0
-  hm-sfm export photos out/castle               stop at out/castle/database.db, for COLMAP's GUI or mapper
-  hm-sfm reconstruct photos out/k --camera-model PINHOLE --camera-params 919.8,921.8,507.1,335.9
+  hm-sfm demo out/demo                     render a small scene, reconstruct it, compare with the truth
+  hm-sfm reconstruct photos out/castle     a folder of photos -> a COLMAP model in out/castle/sparse/0
+  hm-sfm export photos out/castle          stop at out/castle/database.db, for COLMAP's GUI or mapper
+  hm-sfm reconstruct --help                all options of a command
 
-An interrupted command goes on where it was when it is started again.
+An interrupted or killed command goes on where it was when it is started again.
 exit codes: 0 done, 2 bad arguments or input, 3 no model could be built, 130 interrupted"""
+
+PHOTO_OPTIONS = (
+    ("--pairs", "pairs.mode", "auto|exhaustive|sequential|FILE",
+     "which images to match: all with all; neighbours in the order of their names; those of a file with two names a "
+     "line; or auto, all up to 60 images and a selection beyond"),
+    ("--model", "matching.model", "light|FILE", "the network's weights: bundled ones, or a file made by hm-sfm train"),
+    ("--device", "matching.device", "auto|cpu|cuda", "where the network runs; auto takes the GPU if there is one"),
+    ("--camera-mode", "cameras.mode", "auto|single|per-folder|per-image",
+     "which photos share one camera; auto goes by size and EXIF"),
+    ("--camera-model", "cameras.model", "NAME", "COLMAP's camera model, for example PINHOLE or OPENCV"),
+    ("--camera-params", "cameras.params", "F,...",
+     "known intrinsics in px, in the order of the camera model (PINHOLE: fx,fy,cx,cy), which are then kept as they "
+     "are; otherwise the focal length starts from EXIF and is refined"),
+)  # fmt: skip
+"""Flag, key of the configuration, what it takes, help."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Reports a bad argument as all bad input is reported: in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message} (see {self.prog} --help)")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code."""
-    options = make_parser().parse_args(arguments)
-    logging.basicConfig(format="%(levelname)s: %(message)s", level=logging.ERROR if options.quiet else logging.WARNING)
     try:
+        options = make_parser().parse_args(arguments)
+        level = logging.ERROR if options.quiet else logging.WARNING
+        logging.basicConfig(format="%(levelname)s: %(message)s", level=level)
         return options.run(options)
     except HmSfmError as error:
         print(f"hm-sfm: {error}", file=sys.stderr)
         return error.exit_code
     except OSError as error:
-        print(f"hm-sfm: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        text = f"{error.filename}: {error.strerror}" if error.filename else " ".join(str(error).split())
+        print(f"hm-sfm: {text}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("hm-sfm: interrupted; the same command goes on from here", file=sys.stderr)
@@ -41,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """All commands and their options."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="hm-sfm",
         description="3D models from photos: dense matches with homographies, persistent keypoints, COLMAP.",
         epilog=EXAMPLES,
@@ -52,25 +77,30 @@ def make_parser() -> argparse.ArgumentParser:
     quiet = argparse.ArgumentParser(add_help=False)
     quiet.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
 
-    for name, run, text in (
-        ("reconstruct", run_reconstruct, "photos -> a COLMAP model in OUT/sparse/0"),
-        ("match", run_match, "photos -> pairs and matches only (OUT/matches.h5)"),
-        ("export", run_export, "photos -> OUT/database.db, verified, for COLMAP's GUI or mapper"),
-    ):
-        command = commands.add_parser(name, parents=[quiet], help=text, description=text)
+    for name, run, text, more in (
+        ("reconstruct", run_reconstruct, "photos -> a COLMAP model in OUT/sparse/0",
+         "Also leaves OUT/pairs.txt, OUT/matches.h5, OUT/database.db and OUT/summary.json."),
+        ("match", run_match, "photos -> pairs and matches only, OUT/pairs.txt and OUT/matches.h5",
+         "reconstruct or export with the same OUT goes on from there."),
+        ("export", run_export, "photos -> OUT/database.db, verified, for COLMAP's GUI or mapper",
+         "The database holds cameras, images, persistent keypoints, matches and two-view geometries."),
+    ):  # fmt: skip
+        command = commands.add_parser(name, parents=[quiet], help=text, description=f"{text}. {more}")
         add_photo_options(command)
         command.set_defaults(run=run)
 
-    text = "render a scene with known cameras, reconstruct it and print the error"
-    command = commands.add_parser("demo", parents=[quiet], help=text, description=text)
+    text = "render a small scene with known cameras, reconstruct it and print the error"
+    command = commands.add_parser("demo", parents=[quiet], help=text, description=f"{text}. Needs no photos.")
     command.add_argument("out", metavar="OUT", type=Path, help="folder for the photos and the model")
     command.set_defaults(run=run_demo)
 
-    text = "train the network on a folder of photos"
-    command = commands.add_parser("train", parents=[quiet], help=text, description=text)
-    command.add_argument("--config", type=Path, required=True, help="YAML, for example configs/train_light.yaml")
+    text = "train the network's fine stage on a folder of photos"
+    more = "The configuration names the photos, the output folder and the weights to start from."
+    command = commands.add_parser("train", parents=[quiet], help=text, description=f"{text}. {more}")
+    text = "YAML file, for example configs/train_light.yaml"
+    command.add_argument("--config", type=Path, metavar="FILE", required=True, help=text)
     command.add_argument("--resume", action="store_true", help="go on from the last checkpoint, if there is one")
-    add_settings(command)
+    add_settings(command, "steps=1000")
     command.set_defaults(run=run_train)
     return parser
 
@@ -78,25 +108,22 @@ def make_parser() -> argparse.ArgumentParser:
 def add_photo_options(command: argparse.ArgumentParser) -> None:
     """The options of all commands that take a folder of photos."""
     command.add_argument("images", metavar="IMAGES", type=Path, help="folder of photos, searched with its subfolders")
-    command.add_argument("out", metavar="OUT", type=Path, help="folder for everything that is made")
-    command.add_argument("--config", type=Path, help="YAML file (default: as configs/light.yaml)")
-    add_settings(command)
-    for flag, key, text in (
-        ("--pairs", "pairs.mode", "auto, exhaustive, sequential, or a file with two image names a line"),
-        ("--model", "matching.model", "bundled weights (light) or a weights file"),
-        ("--device", "matching.device", "auto, cpu or cuda"),
-        ("--camera-mode", "cameras.mode", "auto, single, per-folder or per-image"),
-        ("--camera-model", "cameras.model", "a COLMAP camera model, for example PINHOLE"),
-        ("--camera-params", "cameras.params", "known intrinsics, f,... as the camera model orders them: kept fixed"),
-    ):
-        command.add_argument(flag, dest=key, metavar=flag[2:].split("-")[-1].upper(), help=text)
+    text = "folder for everything that is made: a new one, or that of an earlier run"
+    command.add_argument("out", metavar="OUT", type=Path, help=text)
+    defaults = Config()
+    for flag, key, metavar, text in PHOTO_OPTIONS:
+        section, field = key.split(".")
+        default = getattr(getattr(defaults, section), field)
+        text = f"{text} (default: {default})" if default else text
+        command.add_argument(flag, dest=key, metavar=metavar, help=text)
+    command.add_argument("--config", type=Path, metavar="FILE", help="YAML file of settings like configs/light.yaml")
+    add_settings(command, "images.long_edge_px=1600")
 
 
-def add_settings(command: argparse.ArgumentParser) -> None:
+def add_settings(command: argparse.ArgumentParser, example: str) -> None:
     """--set, for any key of the configuration."""
-    command.add_argument(
-        "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="section.key=value; repeatable"
-    )
+    text = f"change one setting of the configuration, for example {example}; may be repeated"
+    command.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help=text)
 
 
 def read_config(options: argparse.Namespace) -> Config:

@@ -78,7 +78,7 @@ class VerificationConfig:
 class KeypointConfig:
     """Persistence. Distances in px of the matching resolution, scaled to each photo."""
 
-    carry_radius_px: float = 6.0
+    carry_radius_px: float = 8.0
     """A patch carries points no farther than this from its centre."""
     join_radius_px: float = 1.0
     separation_px: float = 2.0
@@ -118,10 +118,10 @@ class Config:
 def parse_config(tree: Any, cls: type, where: str = "the configuration") -> Any:
     """Build the dataclass `cls` from a tree of dicts; keys that are left out take their defaults.
 
-    Raises ConfigError on an unknown key (naming the nearest one) and on a value of another type.
+    Raises ConfigError on an unknown key (naming the nearest one), a missing one that has no default, and on a value
+    of another type.
     """
-    if tree is None:
-        return cls()
+    tree = {} if tree is None else tree
     if not isinstance(tree, dict):
         raise ConfigError(f"{where} must be a mapping of keys to values, found {tree!r}")
     types = get_type_hints(cls)
@@ -131,6 +131,10 @@ def parse_config(tree: Any, cls: type, where: str = "the configuration") -> Any:
             near = difflib.get_close_matches(str(key), types, n=1, cutoff=0.0)
             raise ConfigError(f"unknown key {key!r} in {where}: did you mean {near[0]!r}?")
         values[key] = _parse_value(value, types[key], f"{where}: {key}")
+    for item in dataclasses.fields(cls):
+        required = item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING
+        if required and item.name not in values:
+            raise ConfigError(f"{where} lacks the key {item.name!r}")
     return cls(**values)
 
 

@@ -123,7 +123,7 @@ def measure_position_error(reconstruction: pycolmap.Reconstruction, truth: dict[
     """RMS distance of the registered cameras from their true places, after the best similarity transform.
 
     The result is relative to the scene's extent, the largest distance between two true cameras: 0.01 is 1 % of it.
-    Returns inf where fewer than three cameras are registered, which no similarity can be fitted to.
+    Returns inf where fewer than three cameras are registered: any two would fit.
     """
     poses = _registered_poses(reconstruction)
     names = sorted(poses.keys() & truth.keys())
@@ -131,14 +131,24 @@ def measure_position_error(reconstruction: pycolmap.Reconstruction, truth: dict[
         return np.inf
     found = np.array([-poses[name][:, :3].T @ poses[name][:, 3] for name in names])
     true = np.array([truth[name].center for name in names])
-    true_from_found = pycolmap.estimate_sim3d(found, true)
-    if true_from_found is None:
-        return np.inf
-    matrix = true_from_found.matrix()
-    residuals = found @ matrix[:, :3].T + matrix[:, 3] - true
+    residuals = _fit_similarity(found, true) - true
     everywhere = np.array([view.center for view in truth.values()])
     extent = np.linalg.norm(everywhere[:, None] - everywhere[None], axis=2).max()
     return float(np.sqrt((residuals**2).sum(axis=1).mean()) / extent)
+
+
+def _fit_similarity(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """`source` (N, 3) carried onto `target` (N, 3) by the least-squares similarity transform (Umeyama 1991).
+
+    pycolmap.estimate_sim3d gives up where the points lie in a plane, as cameras at one height do.
+    """
+    source = source - source.mean(axis=0)
+    centered = target - target.mean(axis=0)
+    left, singular, right = np.linalg.svd(centered.T @ source)
+    sign = np.array([1, 1, np.linalg.det(left) * np.linalg.det(right)])
+    spread = (source**2).sum()
+    scale = (singular * sign).sum() / spread if spread > 0 else 0.0
+    return scale * source @ ((left * sign) @ right).T + target.mean(axis=0)
 
 
 def _registered_poses(reconstruction: pycolmap.Reconstruction) -> dict[str, np.ndarray]:

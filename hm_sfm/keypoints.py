@@ -25,6 +25,9 @@ from hm_sfm.types import ImagePair, IndexMatches, Keypoints, PairMatches, apply_
 SEED_CELL_PX = 8
 BUDGET_CELL_PX = 32
 """The budget of keypoints is spread over square cells of this size."""
+AGREEMENT_PX = 0.5
+"""Distance from the mean at which a patch's say on a carried point counts half."""
+AGREEMENT_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -138,17 +141,13 @@ def carry_points(
     """Place points of one image in the other, one to one with what is there.
 
     xy: (N, 2) units; there_xy: (K, 2) keypoints of the other image, free (K,) bool: not yet linked in this pair;
-    size_there: (2,) units. A point is carried by the nearest patch centre within carry_radius_px. It joins the free
-    keypoint within join_radius_px where each is the other's nearest; it founds a keypoint where none lies within
+    size_there: (2,) units. A point is carried by the patches within carry_radius_px. It joins the free keypoint
+    within join_radius_px where each is the other's nearest; it founds a keypoint where none lies within
     separation_px, free or not, nor a better-scored founder; otherwise it is dropped.
     """
-    patch, _ = find_nearest(xy, carrier.centre, config.carry_radius_px)
-    point = np.flatnonzero(patch >= 0)
-    homography = carrier.homography[patch[point]]
-    predicted = apply_homographies(homography, xy[point]).astype(np.float64)
+    point, predicted, jacobian, score = predict_points(xy, carrier, config.carry_radius_px)
     inside = np.all((predicted >= 0) & (predicted < size_there), axis=1)
-    point, homography, predicted = point[inside], homography[inside], predicted[inside]
-    score = carrier.score[patch[point]]
+    point, predicted, jacobian, score = point[inside], predicted[inside], jacobian[inside], score[inside]
 
     nearest, distance = find_nearest(predicted, there_xy, config.separation_px)
     # Index -1, no neighbour, meets the appended False.
@@ -163,8 +162,38 @@ def carry_points(
     founds = founds[thin_points(predicted[founds], config.separation_px)]
     kept = np.sort(np.concatenate([np.flatnonzero(joins), founds]))
     target = np.where(joins[kept], nearest[kept], -1)
-    jacobian = differentiate(homography[kept], xy[point[kept]])
-    return Carried(point[kept], target, predicted[kept], jacobian, score[kept])
+    return Carried(point[kept], target, predicted[kept], jacobian[kept], score[kept])
+
+
+def predict_points(
+    xy: np.ndarray, carrier: Carrier, radius: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Where the patches within `radius` put points: the robust mean of what they say, near patches counting more.
+
+    xy: (N, 2) units. Returns point (C,) int64, the points that any patch covers, predicted (C, 2), jacobian
+    (C, 2, 2) and score (C,): the patches' mean score times the share of them that agrees.
+    """
+    at, patch, distance = find_pairs_within(xy, carrier.centre, radius)
+    point, slot = np.unique(at, return_inverse=True)
+    homography = carrier.homography[patch]
+    says = apply_homographies(homography, xy[at]).astype(np.float64)
+    prior = carrier.score[patch] * (1.05 - distance / radius)
+    trust = prior
+    for _ in range(AGREEMENT_ROUNDS):
+        predicted = mean_in_groups(says, slot, trust, len(point))
+        apart = np.linalg.norm(says - predicted[slot], axis=1)
+        trust = prior / (1 + (apart / AGREEMENT_PX) ** 2)
+    jacobian = mean_in_groups(differentiate(homography, xy[at]).reshape(-1, 4), slot, trust, len(point))
+    share = np.bincount(slot, trust, len(point)) / np.bincount(slot, prior, len(point))
+    score = mean_in_groups(carrier.score[patch][:, None], slot, prior, len(point))[:, 0] * share
+    return point, predicted, jacobian.reshape(-1, 2, 2), score
+
+
+def mean_in_groups(values: np.ndarray, group: np.ndarray, weight: np.ndarray, count: int) -> np.ndarray:
+    """Weighted means of values (N, D) by group (N,) int64: (count, D)."""
+    total = np.bincount(group, weight, count)
+    sums = [np.bincount(group, weight * column, count) for column in values.T]
+    return np.stack(sums, axis=1) / np.maximum(total, 1e-12)[:, None]
 
 
 def differentiate(homography: np.ndarray, xy: np.ndarray) -> np.ndarray:
@@ -258,7 +287,8 @@ def finish_keypoints(
     size = np.array([np.array(photo.size_wh) / photo.px_per_unit for photo in photos]).reshape(-1, 2)
     inside = np.all((moved >= 0) & (moved < size[image]), axis=1)
     length = measure_lengths(label)
-    kept = inside & (length >= 2) & choose_budget(label, length, sigma, moved, image, config.max_keypoints)
+    kept = inside & (length >= 2)
+    kept[kept] = choose_budget(label[kept], length[kept], sigma[kept], moved[kept], image[kept], config.max_keypoints)
     new_index = np.cumsum(kept) - 1
     kept_start = np.concatenate([[0], np.cumsum(np.bincount(image[kept], minlength=len(photos)))])
 

@@ -50,10 +50,10 @@ class VerifiedPair:
 
 
 @contextmanager
-def _quiet_colmap() -> Iterator[None]:
-    """Keep COLMAP's progress messages off stderr; its warnings and errors still show."""
+def _quiet_colmap(level: pycolmap.logging.Level = pycolmap.logging.WARNING) -> Iterator[None]:
+    """Keep COLMAP's messages below `level` off stderr."""
     before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(before, int(pycolmap.logging.WARNING))
+    pycolmap.logging.minloglevel = max(before, int(level))
     try:
         yield
     finally:
@@ -226,7 +226,8 @@ def map_incrementally(
         if can_map:
             raw = Path(temporary) / "mapper"
             raw.mkdir()
-            with _quiet_colmap():
+            # The one error that COLMAP logs here is that there is no model, which the caller is told anyway.
+            with _quiet_colmap(pycolmap.logging.FATAL):
                 models = _run_mapper(database_path, image_folder, raw, config, fix_intrinsics, on_image)
         models.sort(key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
 

@@ -7,6 +7,7 @@ import dataclasses
 import json
 import os
 import time
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -24,7 +25,7 @@ from hm_sfm.matching import match_pairs
 from hm_sfm.network.model import HomoMatcher, digest_weights
 from hm_sfm.pairs import select_pairs, write_pairs
 from hm_sfm.store import MatchStore, digest_image
-from hm_sfm.types import ImagePair, ImageRef, MappingResult, PairMatches
+from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, MappingResult, PairMatches
 
 MARKER = ".hm_sfm"
 """File by which a folder is known as the output of a run."""
@@ -58,9 +59,7 @@ def match_photos(image_folder: Path, out: Path, config: Config, quiet: bool = Fa
     matcher = HomoMatcher.from_pretrained(
         config.matching.model, config=config.matching, images=config.images, network=config.network
     )
-    store = MatchStore(
-        out / "matches.h5", describe_matching(config), {image.name: digest_image(image) for image in images}
-    )
+    store = open_store(out / "matches.h5", images, config)
     write_pairs(out / "pairs.txt", pairs)
     times = match_pairs(images, pairs, matcher, store, quiet)
     return Matched(images, len(listed.skipped), pairs, cameras, store, dataclasses.asdict(times))
@@ -70,26 +69,14 @@ def export_database(image_folder: Path, out: Path, config: Config, quiet: bool =
     """As match_photos, then OUT/database.db with persistent keypoints and verified matches."""
     matched = match_photos(image_folder, out, config, quiet)
     out, images = Path(out), matched.images
-    long_edge_px = config.images.long_edge_px
-    px_per_unit = {image.name: max(1.0, max(image.size_wh) / long_edge_px) for image in images}
+    px_per_unit = measure_units(images, config)
     cameras = {image.name: matched.cameras.cameras[i] for image, i in zip(images, matched.cameras.camera_index)}
     with stopwatch(matched.seconds, "verify"):
         verified = verify_pairs(
             images, matched.pairs, matched.store.read, cameras, px_per_unit, config.verification, quiet
         )
     with stopwatch(matched.seconds, "keypoints"):
-        photos = [
-            Photo(image.name, image.size_wh, px_per_unit[image.name], find_seeds(prepare_image(image, long_edge_px)))
-            for image in tqdm(images, desc="seeds", unit="image", disable=quiet)
-        ]
-        ranked = sorted(verified.values(), key=lambda found: (-found.strength, found.pair))
-        keypoints, matches = persist_keypoints(
-            photos,
-            [found.pair for found in ranked],
-            lambda pair: take_inliers(matched.store.read(pair), verified[pair]),
-            config.keypoints,
-            quiet,
-        )
+        keypoints, matches = carry_keypoints(images, verified, matched.store, config, quiet)
     with stopwatch(matched.seconds, "verify"):
         database = out / "database.db"
         write_database(database, images, matched.cameras, keypoints, matches)
@@ -153,6 +140,47 @@ def describe_matching(config: Config) -> dict[str, object]:
             if (section, key) not in {("matching", "device"), ("matching", "feature_cache_mb"), ("matching", "model")}:
                 described[f"{section}.{key}"] = value
     return described
+
+
+def open_store(path: Path, images: Sequence[ImageRef], config: Config) -> MatchStore:
+    """The matches of a run, for these photos and settings. Raises what MatchStore raises."""
+    return MatchStore(path, describe_matching(config), {image.name: digest_image(image) for image in images})
+
+
+def measure_units(images: Sequence[ImageRef], config: Config) -> dict[str, float]:
+    """Image name -> px of the stored image per px of the matching resolution."""
+    return {image.name: max(1.0, max(image.size_wh) / config.images.long_edge_px) for image in images}
+
+
+def carry_keypoints(
+    images: Sequence[ImageRef],
+    verified: Mapping[ImagePair, VerifiedPair],
+    store: MatchStore,
+    config: Config,
+    quiet: bool = False,
+) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
+    """persist_keypoints over the verified pairs, strongest first. Raises InputError on an undecodable photo.
+
+    Returns the Keypoints of every image, in the order of `images`, and the IndexMatches of the pairs that share tracks.
+    """
+    px_per_unit = measure_units(images, config)
+    photos = [
+        Photo(
+            image.name,
+            image.size_wh,
+            px_per_unit[image.name],
+            find_seeds(prepare_image(image, config.images.long_edge_px)),
+        )
+        for image in tqdm(images, desc="seeds", unit="image", disable=quiet)
+    ]
+    ranked = sorted(verified.values(), key=lambda found: (-found.strength, found.pair))
+    return persist_keypoints(
+        photos,
+        [found.pair for found in ranked],
+        lambda pair: take_inliers(store.read(pair), verified[pair]),
+        config.keypoints,
+        quiet,
+    )
 
 
 def take_inliers(matches: PairMatches, verified: VerifiedPair) -> PairMatches:

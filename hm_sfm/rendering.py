@@ -22,6 +22,8 @@ SAMPLES = 2
 NEAR_M = 1e-3
 DEMO_FOCAL_35MM = 28
 """EXIF stores whole millimetres, so that the focal length derived from the photo is exactly the rendered one."""
+COLMAP_DIAGONAL_35MM = 43.27
+"""COLMAP's rounded diagonal of 35 mm film, which EXIF's equivalent focal length refers to."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,10 @@ def render_view(
     colours = np.empty((*nearest.shape, 3), dtype=np.float32)
     colours[:] = background_rgb
     for index, quad in enumerate(quads):
-        rows, columns = np.nonzero(nearest == index)
+        box = _find_box(quad, view, SAMPLES)
+        rows, columns = np.nonzero(nearest[box] == index)
         if len(rows):
+            rows, columns = rows + box[0].start, columns + box[1].start
             colours[rows, columns] = _colour_samples(quad, view, columns, rows)
     width, height = view.size_wh
     mean = cv2.resize(colours, (width, height), interpolation=cv2.INTER_AREA)
@@ -177,7 +181,7 @@ def make_texture(rng: np.random.Generator, material: str, size_m: tuple[float, f
     texture = MATERIALS[material](rng, size_hw, texels_per_m)
     texture *= 1 + 0.10 * _make_noise(rng, size_hw, (1.2 * texels_per_m, 1.2 * texels_per_m), 3)[..., None]
     texture *= 1 + 0.05 * _make_noise(rng, size_hw, (6, 6), 3)[..., None]
-    _scatter_specks(rng, texture, count=round(60 * size_m[0] * size_m[1]), radius_px=0.02 * texels_per_m)
+    _scatter_specks(rng, texture, count=round(30 * size_m[0] * size_m[1]), radius_px=0.02 * texels_per_m)
     return np.clip(np.rint(texture), 0, 255).astype(np.uint8)
 
 
@@ -226,7 +230,7 @@ def _make_masonry(
 
     palette = np.array(colours, dtype=np.float32)[rng.integers(0, len(colours), starts.shape)]
     palette *= rng.uniform(0.72, 1.22, (*starts.shape, 1)).astype(np.float32)
-    palette += rng.normal(0, 6, palette.shape).astype(np.float32)
+    palette += rng.normal(0, 2.5, palette.shape).astype(np.float32)
     stone = palette[row, column]
     grain = _make_noise(rng, size_hw, (stone_w / 3, stone_h / 3 + 2), 5)
     stone *= 1 + 0.16 * grain[..., None]
@@ -318,10 +322,10 @@ def _make_mural(rng: np.random.Generator, size_hw: tuple[int, int], texels_per_m
     """Blotches of many colours, as of a painted wall or a printed cloth."""
     m = texels_per_m
     mural = np.empty((*size_hw, 3), dtype=np.float32)
-    mural[:] = rng.uniform(90, 200, 3)
+    mural[:] = rng.uniform(110, 170) + rng.uniform(-25, 25, 3)
     for scale in (0.6, 0.45, 0.3, 0.3, 0.2, 0.2, 0.12, 0.12):
         shape = _make_noise(rng, size_hw, (scale * m, scale * m), 4)
-        _blend(mural, tuple(rng.uniform(30, 230, 3)), 0.8 * np.clip((shape - 0.9) * 5, 0, 1))
+        _blend(mural, tuple(rng.uniform(45, 200) + rng.uniform(-45, 45, 3)), 0.8 * np.clip((shape - 0.9) * 5, 0, 1))
     _crack(rng, mural, m)
     return mural
 
@@ -374,10 +378,10 @@ def _scatter_specks(
         reach = int(2 * radius) + 1
         rows, columns = slice(max(y - reach, 0), y + reach + 1), slice(max(x - reach, 0), x + reach + 1)
         patch = texture[rows, columns]
-        dy, dx = np.ogrid[rows.start : rows.start + patch.shape[0], columns.start : columns.start + patch.shape[1]]
-        angle = tone * 7
-        along = (dx - x) * np.cos(angle) + (dy - y) * np.sin(angle)
-        across = (dy - y) * np.cos(angle) - (dx - x) * np.sin(angle)
+        dy = np.arange(rows.start - y, rows.start - y + patch.shape[0], dtype=np.float32)[:, None]
+        dx = np.arange(columns.start - x, columns.start - x + patch.shape[1], dtype=np.float32)
+        cos, sin = np.float32(np.cos(7 * tone)), np.float32(np.sin(7 * tone))
+        along, across = dx * cos + dy * sin, dy * cos - dx * sin
         cover = np.clip((radius - np.hypot(along, across * (1.3 + abs(tone)))) + 0.5, 0, 1).astype(np.float32)
         if colours:
             _blend(patch, colours[int(abs(tone) * 1000) % len(colours)], 0.85 * cover)
@@ -447,7 +451,8 @@ def make_box(
     top = np.array([*center_xy, base_m + height])
     down = np.array([0, 0, -height])
     faces = []
-    for out, right, reach, side in ((-y, x, depth, length), (x, y, length, depth), (y, -x, depth, length), (-x, -y, length, depth)):
+    sides = ((-y, x, depth, length), (x, y, length, depth), (y, -x, depth, length), (-x, -y, length, depth))
+    for out, right, reach, side in sides:
         texture = make_texture(rng, material, (side, height), texels_per_m)
         faces.append(Quad(top + out * reach / 2 - right * side / 2, right * side, down, texture))
     lid = make_texture(rng, material, (length, depth), texels_per_m)
@@ -462,7 +467,7 @@ def make_demo_scene(seed: int = 0) -> tuple[Quad, ...]:
     """
     rng = np.random.default_rng(seed)
     quads = [
-        Quad((-11, -11, 0), (22, 0, 0), (0, 22, 0), make_texture(rng, "paving", (22, 22), 80)),
+        Quad((-10, -8, 0), (20, 0, 0), (0, 14.5, 0), make_texture(rng, "paving", (20, 14.5), 80)),
         Quad((-6, 5.5, 4.6), (12, 0, 0), (0, 0, -4.6), make_texture(rng, "bricks", (12, 4.6), 128)),
         Quad((-6, -0.5, 3.4), (0, 6, 0), (0, 0, -3.4), make_texture(rng, "plaster", (6, 3.4), 128)),
         Quad((6, 5.5, 3.9), (0, -5, 0), (0, 0, -3.9), make_texture(rng, "stones", (5, 3.9), 128)),
@@ -484,7 +489,7 @@ def make_demo_scene(seed: int = 0) -> tuple[Quad, ...]:
 def make_demo_views(count: int = 12, size_wh: tuple[int, int] = (640, 480)) -> tuple[PinholeView, ...]:
     """Cameras of one K on an arc in front of the courtyard, at most 7.5 degrees apart, at differing heights."""
     width, height = size_wh
-    focal_px = DEMO_FOCAL_35MM * np.hypot(width, height) / np.hypot(36, 24)
+    focal_px = DEMO_FOCAL_35MM * np.hypot(width, height) / COLMAP_DIAGONAL_35MM
     k = np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
     half_deg = min(7.5 * (count - 1), 82.5) / 2
     views = []
@@ -492,7 +497,7 @@ def make_demo_views(count: int = 12, size_wh: tuple[int, int] = (640, 480)) -> t
         # Incommensurate waves instead of random numbers: every count gives well-mixed heights, aims and tilts.
         radius, height_m = 7.6 + 0.5 * np.sin(2.4 * index), 1.9 + 0.55 * np.sin(1.7 * index + 1)
         center = np.array([radius * np.sin(angle), 1.2 - radius * np.cos(angle), height_m])
-        target = np.array([0.5 * np.sin(1.1 * index), 1.2 + 0.4 * np.cos(2.0 * index), 1.25])
+        target = np.array([0.5 * np.sin(1.1 * index), 1.2 + 0.4 * np.cos(2.0 * index), 0.95])
         views.append(PinholeView(k, size_wh, _look_at(center, target, roll=np.radians(3 * np.sin(3.1 * index)))))
     return tuple(views)
 

@@ -69,7 +69,8 @@ class MatchStore:
         if not batch:
             return
         self.parts.mkdir(parents=True, exist_ok=True)
-        path = self.parts / f"{len(list(self.parts.glob('*.h5'))):06d}.h5"
+        last = max((int(path.stem) for path in self.parts.glob("*.h5")), default=-1)
+        path = self.parts / f"{last + 1:06d}.h5"
         temporary = path.with_suffix(".tmp")
         with h5py.File(temporary, "w") as h5:
             self._stamp(h5)
@@ -103,7 +104,8 @@ class MatchStore:
     def _stamp(self, h5: h5py.File) -> None:
         h5.attrs["version"] = VERSION
         h5.attrs["made_by"] = json.dumps(self.made_by, sort_keys=True)
-        h5.attrs["images"] = sorted(self.digests.values())
+        # One string, not a list: HDF5 holds lists of at most 64 KB, some 4000 photos.
+        h5.attrs["images"] = " ".join(sorted(self.digests.values()))
 
     def _write_pair(self, h5: h5py.File, group: str, matches: PairMatches) -> None:
         data = h5.create_group(group)
@@ -120,7 +122,7 @@ class MatchStore:
                 if h5.attrs.get("version") != VERSION:
                     raise StaleResultError(f"{file} is of another version of hm_sfm: name another OUT or delete it")
                 self._compare_settings(file, json.loads(h5.attrs["made_by"]))
-                if not set(h5.attrs["images"]) & set(self.digests.values()):
+                if not set(h5.attrs["images"].split()) & set(self.digests.values()):
                     raise StaleResultError(f"{file} was made from other photos: name another OUT or delete it")
                 for group, data in h5.items():
                     attrs = data.attrs

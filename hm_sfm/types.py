@@ -103,8 +103,9 @@ class PatchMatches:
     def densify(self, radius: int) -> tuple[np.ndarray, np.ndarray]:
         """The dense matches M_d of the paper: all pixel centres of image 0 around the patch centres.
 
-        radius: px of image 0, at most patch_radius_px; a pixel belongs to the square of that half side around a
-        patch centre. Overlaps go to the nearest centre. Returns xy0 and xy1, (N, 2) float32 px each, row by row.
+        radius: px of image 0, at most patch_radius_px; a patch takes the square of 2 * radius + 1 pixels around the
+        one that holds its centre. Overlaps go to the nearest centre. Returns xy0 and xy1, (N, 2) float32 px each,
+        row by row.
         """
         if not 0 <= radius <= self.patch_radius_px:
             raise ValueError(f"radius must be within [0, {self.patch_radius_px}] px, got {radius}")
@@ -112,7 +113,8 @@ class PatchMatches:
         square = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         pixels = (np.floor(self.xy0).astype(np.int64)[:, None] + square).reshape(-1, 2)
         xy0 = (np.unique(pixels[:, ::-1], axis=0)[:, ::-1] + 0.5).astype(np.float32)
-        index, _ = find_nearest(xy0, self.xy0, 1.5 * max(radius, 1))
+        # A centre may lie at the edge of its pixel: the square's farthest corner is sqrt(2) (radius + 1/2) away.
+        index, _ = find_nearest(xy0, self.xy0, 1.5 * (radius + 0.5))
         return xy0, apply_homographies(self.homography[index], xy0)
 
 

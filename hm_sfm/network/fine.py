@@ -25,25 +25,38 @@ class FineEstimate:
     """(P,): log of the expected error (Laplace scale), cells."""
 
 
-def gather_patches(fine: Tensor, image_index: Tensor, centre: Tensor, side: int) -> Tensor:
+@dataclass(frozen=True)
+class FineMap:
+    """Fine features laid out for cutting patches: made once per image, by make_fine_map."""
+
+    cells: Tensor
+    """(B, H * W + 1, C): row by row; the last row is zero and stands for all cells outside the map."""
+    size_wh: tuple[int, int]
+    """Cells."""
+
+
+def make_fine_map(fine: Tensor) -> FineMap:
+    """(B, C, H, W) fine features -> FineMap."""
+    height, width = fine.shape[2:]
+    return FineMap(F.pad(fine.flatten(2).transpose(1, 2), (0, 0, 0, 1)), (width, height))
+
+
+def gather_patches(fine: FineMap, image_index: Tensor, centre: Tensor, side: int) -> Tensor:
     """Cut square patches out of fine features; cells outside the map are zero.
 
-    fine: (B, C, H, W); image_index: (P,) int64; centre: (P, 2) int64 cells (x, y); side: odd.
-    Returns (P, side * side, C), row by row.
+    image_index: (P,) int64; centre: (P, 2) int64 cells (x, y); side: odd. Returns (P, side * side, C), row by row.
     """
-    half = side // 2
-    channels, height, width = fine.shape[1:]
-    # Centres off the map see zeros only, whatever their distance: clamping bounds the padding.
-    x = centre[:, 0].clamp(-half - 1, width + half)
-    y = centre[:, 1].clamp(-half - 1, height + half)
-    pad = side
-    padded = F.pad(fine.permute(0, 2, 3, 1), (0, 0, pad, pad, pad, pad))
-    padded_height, padded_width = padded.shape[1:3]
-    offsets = torch.arange(-half, half + 1, device=fine.device)
-    rows = (image_index * padded_height + y + pad)[:, None] + offsets
-    columns = (x + pad)[:, None] + offsets
-    index = rows[:, :, None] * padded_width + columns[:, None, :]
-    return padded.reshape(-1, channels)[index.reshape(-1)].view(len(centre), side * side, channels)
+    width, height = fine.size_wh
+    cells = width * height
+    steps = torch.arange(-(side // 2), side // 2 + 1, device=centre.device)
+    x, y = (centre[:, :, None] + steps).unbind(dim=1)
+    # Out of range in either direction, the sum is at least `cells`, and clamps to the row of zeros.
+    x = torch.where((x >= 0) & (x < width), x, cells)
+    y = torch.where((y >= 0) & (y < height), y * width, cells)
+    index = (y[:, :, None] + x[:, None]).clamp_max_(cells).flatten(1)
+    index += image_index[:, None] * (cells + 1)
+    channels = fine.cells.shape[2]
+    return fine.cells.reshape(-1, channels)[index.flatten()].view(len(centre), side * side, channels)
 
 
 def correlate_patches(patch0: Tensor, patch1: Tensor) -> Tensor:
@@ -100,8 +113,6 @@ class HomographyHead(nn.Module):
 
     def __init__(self, window: int, radius: int, iterations: int, margin: int) -> None:
         super().__init__()
-        if window < 5 or (window - 1) & (window - 2):
-            raise ValueError(f"window must be 5, 9, 17 ..., got {window}")
         self.window, self.radius, self.iterations, self.margin = window, radius, iterations, margin
         channels = 2 * (2 * radius + 1) ** 2 + 4
         layers: list[nn.Module] = [nn.Conv2d(channels, 64, 3, padding=1), nn.ReLU(inplace=True)]
@@ -123,11 +134,13 @@ class HomographyHead(nn.Module):
         """Distance of a patch's corner cells from its centre along each axis, cells."""
         return (self.window - 1) / 2
 
-    def forward(self, fine0: Tensor, fine1: Tensor, image_index: Tensor, cell0: Tensor, cell1: Tensor) -> list:
+    def forward(
+        self, fine0: FineMap, fine1: FineMap, image_index: Tensor, cell0: Tensor, cell1: Tensor
+    ) -> list[FineEstimate]:
         """Homographies from the patch around cell0 of fine0 to the patch around cell1 of fine1.
 
-        fine0, fine1: (B, C, H, W); image_index: (P,) int64; cell0, cell1: (P, 2) int64, cells of the 1/2 grid.
-        Returns the FineEstimate of each iteration.
+        image_index: (P,) int64, into both batches; cell0, cell1: (P, 2) int64, cells of the 1/2 grid. Returns the
+        FineEstimate of each iteration.
         """
         patch0 = gather_patches(fine0, image_index, cell0, self.window)
         patch1 = gather_patches(fine1, image_index, cell1, self.window + 2 * self.margin)
@@ -159,7 +172,7 @@ class HomographyHead(nn.Module):
                 grid.reshape(-1, 2).T.to(full.dtype),
             ]
         )
-        maps = samples.T.reshape(len(target), self.window, self.window, -1).permute(0, 3, 1, 2)
+        maps = samples.T.reshape(len(target), self.window, self.window, len(samples)).permute(0, 3, 1, 2)
         code = self.encoder(maps)
         # A bounded step: unbounded ones fold patches over early in training, and never recover.
         residual = self.half * torch.tanh(self.corners(code).float())
@@ -184,7 +197,9 @@ class ExpectationHead(nn.Module):
         """As in HomographyHead."""
         return (self.window - 1) / 2
 
-    def forward(self, fine0: Tensor, fine1: Tensor, image_index: Tensor, cell0: Tensor, cell1: Tensor) -> list:
+    def forward(
+        self, fine0: FineMap, fine1: FineMap, image_index: Tensor, cell0: Tensor, cell1: Tensor
+    ) -> list[FineEstimate]:
         """As HomographyHead.forward; a list of one FineEstimate."""
         patch0 = gather_patches(fine0, image_index, cell0, 1)
         patch1 = gather_patches(fine1, image_index, cell1, self.window + 2 * self.margin)

@@ -16,24 +16,29 @@ from hm_sfm.errors import ConfigError, WeightsError
 from hm_sfm.images import PreparedImage, prepare_array, prepare_image, read_ref
 from hm_sfm.network.backbone import LightBackbone
 from hm_sfm.network.coarse import match_cells
-from hm_sfm.network.fine import ExpectationHead, FineEstimate, HomographyHead
+from hm_sfm.network.fine import ExpectationHead, FineMap, HomographyHead, make_fine_map
 from hm_sfm.network.homography import is_regular
 from hm_sfm.types import PatchMatches
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
-FINE_CHUNK = 1024
-"""Patches per call of the fine head: bounds its memory to about 100 MB."""
+FINE_CHUNK = 512
+"""Patches per call of the fine head: bounds its memory to about 50 MB."""
 
 
 class HomoNet(nn.Module):
     """Backbone and fine head. The parts are called one by one: features once per image, the head per pair.
 
-    Raises ConfigError where the configuration names no known backbone or head, or an impossible window.
+    Raises ConfigError where the configuration names no known backbone or head, or an impossible size.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
+        if config.window < 5 or (config.window - 1) & (config.window - 2):
+            raise ConfigError(f"network.window must be 5, 9, 17 ..., found {config.window}")
+        for field, least in (("radius", 0), ("iterations", 1), ("margin", 0)):
+            if getattr(config, field) < least:
+                raise ConfigError(f"network.{field} must be at least {least}, found {getattr(config, field)}")
         if config.backbone != "light":
             raise ConfigError(f"network.backbone must be light, found {config.backbone!r}")
         self.backbone = LightBackbone()
@@ -53,8 +58,7 @@ class ImageFeatures:
     """(N, C) float32, unit rows: the 1/8 cells whose centre lies in the image."""
     cell: Tensor
     """(N, 2) int64: their grid positions (x, y)."""
-    fine: Tensor
-    """(1, C, H/2, W/2)."""
+    fine: FineMap
     scaled_wh: tuple[int, int]
     stored_from_scaled: np.ndarray
     """(3, 3) float64: px of the network's input -> px of the stored image."""
@@ -62,7 +66,7 @@ class ImageFeatures:
     @property
     def size_bytes(self) -> int:
         """Memory that the features take."""
-        return sum(t.numel() * t.element_size() for t in (self.coarse, self.cell, self.fine))
+        return sum(t.numel() * t.element_size() for t in (self.coarse, self.cell, self.fine.cells))
 
 
 class HomoMatcher:
@@ -111,7 +115,7 @@ class HomoMatcher:
         return ImageFeatures(
             coarse=maps.coarse[0, :, :rows, :columns].flatten(1).T.contiguous(),
             cell=torch.stack([x, y], dim=-1).reshape(-1, 2).to(self.device),
-            fine=maps.fine,
+            fine=make_fine_map(maps.fine),
             scaled_wh=image.scaled_wh,
             stored_from_scaled=image.stored_from_scaled,
         )
@@ -136,7 +140,7 @@ class HomoMatcher:
         return self._to_stored(features0, features1, cell0, cell1, homography, log_scale, regular)
 
     def _to_stored(self, features0, features1, cell0, cell1, homography, log_scale, regular) -> PatchMatches:
-        """From patch coordinates to px of the stored images; drops irregular patches and those out of image 1."""
+        """From patch coordinates to px of the stored images; drops irregular patches and those out of an image."""
         grid, half = self.net.backbone.fine_grid, self.net.head.half
         stored0 = features0.stored_from_scaled @ cell_to_px(cell0.cpu().numpy(), grid)
         stored1 = features1.stored_from_scaled @ cell_to_px(cell1.cpu().numpy(), grid)
@@ -145,12 +149,8 @@ class HomoMatcher:
         mapped = np.einsum("nij,nj->ni", between[:, :, :2], centre0) + between[:, :, 2]
         between = between / mapped[:, 2, None, None]
         centre1 = mapped[:, :2] / mapped[:, 2:]
-        stored_corner = features1.stored_from_scaled @ np.array([*features1.scaled_wh, 1.0])
-        stored_origin = features1.stored_from_scaled @ np.array([0.0, 0.0, 1.0])
-        low, high = np.minimum(stored_origin, stored_corner)[:2], np.maximum(stored_origin, stored_corner)[:2]
         score = score_from_scale(log_scale.cpu().numpy().astype(np.float64), grid)
-        keep = regular & np.all((centre1 >= low) & (centre1 < high), axis=1)
-        keep = keep.nonzero()[0]
+        keep = (regular & is_inside(centre0, features0) & is_inside(centre1, features1)).nonzero()[0]
         keep = keep[np.argsort(-score[keep], kind="stable")]
         px_per_cell = np.sqrt(abs(np.linalg.det(features0.stored_from_scaled[:2, :2]))) * grid.stride
         return PatchMatches(
@@ -190,6 +190,13 @@ def cell_to_px(cell: np.ndarray, grid: Grid) -> np.ndarray:
     return matrix
 
 
+def is_inside(xy: np.ndarray, features: ImageFeatures) -> np.ndarray:
+    """(M,) bool: which points (M, 2), px of the stored image, lie in it."""
+    width, height = features.scaled_wh
+    corners = features.stored_from_scaled[:2] @ np.array([[0, width], [0, height], [1, 1]])
+    return np.all((xy >= corners.min(axis=1)) & (xy < corners.max(axis=1)), axis=1)
+
+
 def score_from_scale(log_scale: np.ndarray, grid: Grid) -> np.ndarray:
     """Error scale (P,), log cells -> (P,) in [0, 1]: the probability of an error below 1 px (Laplace)."""
     return 1 - np.exp(-1 / (np.exp(log_scale) * grid.stride))
@@ -197,7 +204,7 @@ def score_from_scale(log_scale: np.ndarray, grid: Grid) -> np.ndarray:
 
 def autocast(device: torch.device) -> torch.autocast:
     """Half precision for convolutions and matrix products, where the processor computes it natively."""
-    native = device.type == "cuda" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    native = device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=native)
 
 
@@ -256,7 +263,7 @@ def load_weights(name: str, network: NetworkConfig | None = None) -> HomoNet:
     net = HomoNet(wanted)
     try:
         net.load_state_dict(state_dict)
-    except RuntimeError as error:
+    except (RuntimeError, TypeError) as error:
         raise WeightsError(f"{path} does not fit the network: {' '.join(str(error).split())[:300]}") from error
     return net
 

@@ -19,6 +19,7 @@ from tqdm import tqdm
 from hm_sfm.config import NetworkConfig, fingerprint
 from hm_sfm.errors import ConfigError, HmSfmError, WeightsError
 from hm_sfm.network.backbone import load_xfeat
+from hm_sfm.network.fine import make_fine_map
 from hm_sfm.network.model import HomoNet, pick_device, save_weights
 from hm_sfm.training.losses import measure_errors, measure_loss
 from hm_sfm.training.photos import WarpedPhotos, WarpRange, load_photos, split_photos
@@ -82,6 +83,8 @@ def train(config: TrainConfig, resume: bool = False, quiet: bool = False) -> Pat
     out.mkdir(parents=True, exist_ok=True)
     if checkpoint.exists():
         load_checkpoint(checkpoint, config, state)
+    for name in ("log.csv", "validation.csv"):
+        drop_rows_after(out / name, state.step)
     pairs = WarpedPhotos(training, config.size_px, config.seed, config.steps * config.pairs_per_step, config.warp)
     held_out = WarpedPhotos(validation, config.size_px, config.seed + 1, len(validation), config.warp)
     saved_at = time.monotonic()
@@ -168,7 +171,8 @@ def run_pairs(
     images = images / images.std(dim=(2, 3), keepdim=True).clamp_min(1.0)
     with autocast(config.precision, device):
         fine = backbone(images.flatten(0, 1)[:, None]).fine.unflatten(0, (-1, 2))
-        estimates = net.head(fine[:, 0], fine[:, 1], truth.image_index, truth.cell0, truth.cell1)
+        maps0, maps1 = make_fine_map(fine[:, 0]), make_fine_map(fine[:, 1])
+        estimates = net.head(maps0, maps1, truth.image_index, truth.cell0, truth.cell1)
     return estimates, truth
 
 
@@ -244,6 +248,17 @@ def load_checkpoint(path: Path, config: TrainConfig, state: TrainState) -> None:
 def run_fingerprint(config: TrainConfig) -> str:
     """Fingerprint of what shapes the run; where things lie and how often they are saved does not."""
     return fingerprint(dataclasses.replace(config, images="", out="", xfeat="", checkpoint_seconds=0.0, device=""))
+
+
+def drop_rows_after(path: Path, step: int) -> None:
+    """Remove the rows of a CSV file that an interrupted run logged after its last checkpoint; atomic."""
+    if not path.exists():
+        return
+    lines = path.read_text().splitlines(keepends=True)
+    kept = lines[:1] + [row for row in lines[1:] if int(row.split(",")[0]) <= step]
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text("".join(kept))
+    os.replace(temporary, path)
 
 
 def append_row(path: Path, row: dict) -> None:

@@ -28,7 +28,7 @@ class WarpRange:
     """Ratio of the two scales: between 1 / scale and scale."""
     rotation_deg: float = 45.0
     perspective: float = 0.25
-    """Largest corner shift of each view, as a share of its side."""
+    """Range of the corner shifts of each view, as a share of its side: half of it to either side."""
 
 
 def load_photos(folder: Path) -> list[np.ndarray]:

@@ -1,0 +1,58 @@
+"""A folder of photos -> a COLMAP model, one call a stage: what `hm-sfm reconstruct` does, to copy and change.
+
+    python pipelines/reconstruct_folder.py PHOTOS OUT
+
+Writes OUT/matches.h5, OUT/database.db and OUT/sparse. Started again, it keeps the matches that are there.
+"""
+
+import sys
+from pathlib import Path
+
+from hm_sfm.config import Config
+from hm_sfm.database import make_cameras, write_database
+from hm_sfm.images import list_images
+from hm_sfm.mapping import map_incrementally, summarise_models, verify_database, verify_pairs
+from hm_sfm.matching import match_pairs
+from hm_sfm.network.model import HomoMatcher
+from hm_sfm.pairs import select_pairs
+from hm_sfm.reconstruction import carry_keypoints, claim_folder, measure_units, open_store
+
+
+def reconstruct_folder(photos: Path, out: Path) -> None:
+    config = Config()
+    checks = config.verification
+    claim_folder(out)
+
+    # What there is, and which images to match with which.
+    images = list_images(photos).images
+    pairs = select_pairs([image.name for image in images], config.pairs)
+    cameras = make_cameras(images, config.cameras)
+
+    # Dense matches, each with the homography of its patch.
+    matcher = HomoMatcher.from_pretrained("light")
+    store = open_store(out / "matches.h5", images, config)
+    match_pairs(images, pairs, matcher, store)
+
+    # Only matches that agree with the two-view geometry of their pair may carry keypoints.
+    camera_of = {image.name: cameras.cameras[index] for image, index in zip(images, cameras.camera_index)}
+    px_per_unit = measure_units(images, config)
+    verified = verify_pairs(images, pairs, store.read, camera_of, px_per_unit, checks)
+
+    # Keypoints that persist from image to image, and their matches.
+    keypoints, matches = carry_keypoints(images, verified, store, config)
+
+    # From here on it is COLMAP.
+    database = out / "database.db"
+    write_database(database, images, cameras, keypoints, matches)
+    max_error_px = checks.max_error_px * max(px_per_unit.values())
+    verify_database(database, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
+    models = map_incrementally(database, photos, out / "sparse", config.mapping, fix_intrinsics=False)
+
+    result = summarise_models(models, len(images))
+    print(f"{result.registered} of {result.num_images} images registered, {result.points} points")
+    print(f"mean track length {result.mean_track_length:.2f} images")
+    print(f"mean reprojection error {result.mean_reprojection_px:.3f} px")
+
+
+if __name__ == "__main__":
+    reconstruct_folder(Path(sys.argv[1]), Path(sys.argv[2]))

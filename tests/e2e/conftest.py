@@ -1,0 +1,138 @@
+"""Scenes that are rendered and reconstructed once for all end-to-end tests, and ways to run the command."""
+
+import hashlib
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from hm_sfm.cli import main
+from hm_sfm.network.model import HomoMatcher
+from hm_sfm.rendering import write_demo
+from hm_sfm.types import PinholeView
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What a command left behind."""
+
+    code: int
+    out: str
+    err: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A rendered scene: `folder`/images, `folder`/ground_truth, and the cameras by image name."""
+
+    folder: Path
+    views: dict[str, PinholeView]
+
+    @property
+    def images(self) -> Path:
+        return self.folder / "images"
+
+
+@pytest.fixture(scope="session")
+def spawn() -> Callable[..., Finished]:
+    """Run hm-sfm in a process of its own, as a user does."""
+
+    def run_there(*arguments: object) -> Finished:
+        started = time.monotonic()
+        command = [sys.executable, "-m", "hm_sfm.cli", *map(str, arguments)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+        return Finished(done.returncode, done.stdout, done.stderr, time.monotonic() - started)
+
+    return run_there
+
+
+@pytest.fixture
+def run(capfd) -> Callable[..., Finished]:
+    """Run hm-sfm in this process, which saves loading PyTorch again; capfd also sees what C++ libraries print."""
+
+    def run_here(*arguments: object) -> Finished:
+        capfd.readouterr()
+        started = time.monotonic()
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as stop:  # argparse, after --help and --version
+            code = stop.code
+        out, err = capfd.readouterr()
+        return Finished(code, out, err, time.monotonic() - started)
+
+    return run_here
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory, spawn) -> tuple[Path, Finished]:
+    """`hm-sfm demo OUT`: OUT and what was printed."""
+    out = tmp_path_factory.mktemp("demo") / "out"
+    return out, spawn("demo", out)
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory) -> Scene:
+    """Five small photos of the demo's scene: enough for a model, matched in seconds."""
+    folder = tmp_path_factory.mktemp("scene")
+    return Scene(folder, write_demo(folder, count=5, size_wh=(320, 240)))
+
+
+@pytest.fixture(scope="session")
+def reconstructed(scene, tmp_path_factory) -> Path:
+    """OUT of `hm-sfm reconstruct` on the small scene; not to be changed."""
+    out = tmp_path_factory.mktemp("reconstructed") / "out"
+    assert main(["reconstruct", str(scene.images), str(out), "--quiet"]) == 0
+    return out
+
+
+@pytest.fixture
+def out(reconstructed, tmp_path) -> Path:
+    """A copy of `reconstructed`."""
+    return Path(shutil.copytree(reconstructed, tmp_path / "out"))
+
+
+@pytest.fixture
+def matched_pairs(monkeypatch) -> list[HomoMatcher]:
+    """Grows by one with each pair that the network really matches."""
+    calls: list[HomoMatcher] = []
+    match_features = HomoMatcher.match_features
+
+    def count_call(matcher, *features):
+        calls.append(matcher)
+        return match_features(matcher, *features)
+
+    monkeypatch.setattr(HomoMatcher, "match_features", count_call)
+    return calls
+
+
+@pytest.fixture
+def read_matches() -> Callable[[Path], dict[tuple[str, str], dict[str, np.ndarray]]]:
+    """Read a matches.h5 as anybody would: pair of names -> field -> array."""
+
+    def read(path: Path) -> dict[tuple[str, str], dict[str, np.ndarray]]:
+        with h5py.File(path) as h5:
+            return {
+                (group.attrs["name0"], group.attrs["name1"]): {field: data[()] for field, data in group.items()}
+                for group in h5.values()
+            }
+
+    return read
+
+
+@pytest.fixture
+def digest_files() -> Callable[[Path], dict[str, str]]:
+    """Names and digests of all files below a folder."""
+
+    def digest(folder: Path) -> dict[str, str]:
+        files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+        return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+    return digest

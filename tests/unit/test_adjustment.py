@@ -1,0 +1,114 @@
+"""Joint keypoint adjustment on exact problems with planted noise and outliers."""
+
+import numpy as np
+import pytest
+
+from hm_sfm.adjustment import adjust_keypoints, measure_residuals, predict_targets
+
+
+def make_links(truth, source, target, jacobian, xy, predicted_noise=0.0, rng=None):
+    """Predictions that hold exactly at `truth`, told at the first positions `xy`."""
+    predicted = truth[target] + np.einsum("eij,ej->ei", jacobian, xy[source] - truth[source])
+    return predicted + (rng.normal(0, predicted_noise, predicted.shape) if predicted_noise else 0)
+
+
+def all_links(count):
+    source, target = np.nonzero(~np.eye(count, dtype=bool))
+    return source, target
+
+
+def test_agreeing_links_move_nothing():
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0, 100, (6, 2))
+    source, target = all_links(6)
+    jacobian = np.eye(2) + rng.uniform(-0.3, 0.3, (len(source), 2, 2))
+    predicted = make_links(truth, source, target, jacobian, truth)
+    moved, sigma = adjust_keypoints(truth, source, target, predicted, jacobian, np.ones(len(source)))
+    np.testing.assert_allclose(moved, truth, atol=1e-9)
+    assert sigma.shape == (6,) and (sigma >= 0).all()
+    np.testing.assert_allclose(measure_residuals(truth, moved, source, target, predicted, jacobian), 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("backward", [False, True], ids=["as target", "as source"])
+def test_a_misplaced_keypoint_returns_where_its_links_agree(backward):
+    """Eight exact neighbours that are themselves held by each other pull one keypoint back."""
+    truth = np.random.default_rng(1).uniform(0, 100, (9, 2))
+    xy = truth.copy()
+    xy[8] += (0.6, -0.4)
+    source, target = all_links(8)
+    others, last = np.arange(8), np.full(8, 8)
+    ends = (last, others) if backward else (others, last)
+    source, target = np.concatenate([source, ends[0]]), np.concatenate([target, ends[1]])
+    jacobian = np.tile(np.array([[1.2, 0.1], [-0.2, 0.9]]), (len(source), 1, 1))
+    # Links are told at the first positions: exact ones do not hold where xy is off.
+    predicted = make_links(truth, source, target, jacobian, xy)
+    moved, _ = adjust_keypoints(xy, source, target, predicted, jacobian, np.ones(len(source)))
+    assert np.linalg.norm(xy[8] - truth[8]) > 0.7
+    assert np.linalg.norm(moved[8] - truth[8]) < 0.06
+    assert np.linalg.norm(moved[:8] - truth[:8], axis=1).max() < 0.05
+
+
+def test_averaging_reduces_noise():
+    rng = np.random.default_rng(2)
+    tracks, length, noise = 200, 6, 0.3
+    truth = rng.uniform(0, 500, (tracks * length, 2))
+    source, target = all_links(length)
+    first = np.repeat(np.arange(tracks) * length, len(source))
+    source, target = first + np.tile(source, tracks), first + np.tile(target, tracks)
+    jacobian = np.eye(2) + rng.uniform(-0.1, 0.1, (len(source), 2, 2))
+    xy = truth + rng.normal(0, noise, truth.shape)
+    predicted = make_links(truth, source, target, jacobian, xy, noise, rng)
+    moved, sigma = adjust_keypoints(xy, source, target, predicted, jacobian, np.ones(len(source)))
+
+    def disagreement(positions):
+        """Without the shift that all keypoints of a track share: links cannot know it."""
+        off = (positions - truth).reshape(tracks, length, 2)
+        return (off - off.mean(axis=1, keepdims=True)).std()
+
+    assert disagreement(moved) < 0.55 * disagreement(xy)
+    assert 0.02 < np.median(sigma) < noise
+
+
+def test_one_outlier_has_little_effect():
+    truth = np.random.default_rng(3).uniform(0, 100, (6, 2))
+    source, target = all_links(6)
+    jacobian = np.tile(np.eye(2), (len(source), 1, 1))
+    predicted = make_links(truth, source, target, jacobian, truth)
+    predicted[4] += (8.0, -6.0)
+    moved, _ = adjust_keypoints(truth, source, target, predicted, jacobian, np.ones(len(source)))
+    assert np.linalg.norm(moved - truth, axis=1).max() < 0.05
+    residual = measure_residuals(truth, moved, source, target, predicted, jacobian)
+    assert residual[4] > 9 and np.delete(residual, 4).max() < 0.05
+
+
+def test_a_heavier_link_counts_more():
+    xy = np.zeros((3, 2))
+    source, target = np.array([0, 1]), np.array([2, 2])
+    predicted = np.array([[0.3, 0.0], [-0.3, 0.0]])
+    jacobian = np.tile(np.eye(2), (2, 1, 1))
+    moved, _ = adjust_keypoints(xy, source, target, predicted, jacobian, np.array([1.0, 0.2]))
+    assert moved[2, 0] > 0.01
+
+
+def test_keypoints_without_links_stay():
+    xy = np.array([[3.0, 4.0], [5.0, 6.0]])
+    none = np.zeros(0, np.int64)
+    moved, sigma = adjust_keypoints(xy, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
+    np.testing.assert_allclose(moved, xy)
+    assert np.isfinite(sigma).all()
+
+
+def test_nothing_to_adjust():
+    none = np.zeros(0, np.int64)
+    moved, sigma = adjust_keypoints(np.zeros((0, 2)), none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
+    assert moved.shape == (0, 2) and sigma.shape == (0,)
+
+
+def test_a_prediction_moves_with_its_source():
+    xy = np.array([[10.0, 10.0], [20.0, 20.0]])
+    moved = xy + [[1.0, 0.0], [0.0, 0.0]]
+    jacobian = np.array([[[0.0, -2.0], [2.0, 0.0]]])
+    told = predict_targets(xy, moved, np.array([0]), np.array([[20.0, 20.0]]), jacobian)
+    np.testing.assert_allclose(told, [[20.0, 22.0]])
+    residual = measure_residuals(xy, moved, np.array([0]), np.array([1]), np.array([[20.0, 20.0]]), jacobian)
+    np.testing.assert_allclose(residual, [2.0])

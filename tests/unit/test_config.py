@@ -1,0 +1,153 @@
+"""The configuration: what is accepted, what is refused and how it says so, fingerprints."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from hm_sfm.config import Config, KeypointConfig, NetworkConfig, fingerprint, load_config, parse_config
+from hm_sfm.errors import ConfigError
+from hm_sfm.training.loop import TrainConfig
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+CLASSES = {"train_light.yaml": TrainConfig}
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def leaves(config, prefix: str = "") -> list[tuple[str, object]]:
+    """All values of a configuration by their dotted keys."""
+    found = []
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        name = prefix + field.name
+        found += leaves(value, name + ".") if dataclasses.is_dataclass(value) else [(name, value)]
+    return found
+
+
+def test_the_default_file_spells_out_the_defaults():
+    path = CONFIGS / "light.yaml"
+    assert load_config(path) == Config()
+    text = path.read_text()
+    missing = [name for name, _ in leaves(Config()) if f"{name.split('.')[-1]}:" not in text]
+    assert missing == []
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.name)
+def test_every_configuration_parses(path):
+    assert dataclasses.is_dataclass(load_config(path, cls=CLASSES.get(path.name, Config)))
+
+
+def test_keys_that_are_left_out_keep_their_defaults(tmp_path):
+    config = load_config(write(tmp_path / "c.yaml", "keypoints: {separation_px: 3}\nnetwork:\n"))
+    assert config == dataclasses.replace(Config(), keypoints=KeypointConfig(separation_px=3.0))
+    assert isinstance(config.keypoints.separation_px, float)
+
+
+@pytest.mark.parametrize("text", ["", "# nothing\n", "{}"])
+def test_an_empty_file_is_the_default(tmp_path, text):
+    assert load_config(write(tmp_path / "c.yaml", text)) == Config()
+    assert load_config() == Config()
+
+
+@pytest.mark.parametrize(
+    "text, unknown, near",
+    [
+        ("keypoint: {}", "'keypoint'", "'keypoints'"),
+        ("keypoints: {seperation_px: 2.0}", "'seperation_px'", "'separation_px'"),
+        ("matching: {max_match: 3}", "'max_match'", "'max_matches'"),
+        ("3: 4", "3", "did you mean"),
+    ],
+)
+def test_an_unknown_key_is_refused_and_the_nearest_is_named(tmp_path, text, unknown, near):
+    path = write(tmp_path / "c.yaml", text)
+    with pytest.raises(ConfigError) as error:
+        load_config(path)
+    assert all(part in str(error.value) for part in (str(path), unknown, near))
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "network.window=nine",
+        "network.window=9.0",
+        "network.window=true",
+        "matching.coarse_threshold=[0.8]",
+        "matching.coarse_threshold=false",
+        "matching.model=3",
+        "images.long_edge_px=",
+        "pairs=exhaustive",
+        "pairs=[1, 2]",
+    ],
+)
+def test_a_value_of_another_type_is_refused(setting):
+    section, key = setting.partition("=")[0].split(".")[0], setting.partition("=")[0].split(".")[-1]
+    with pytest.raises(ConfigError) as error:
+        load_config(settings=(setting,))
+    assert section in str(error.value) and key in str(error.value)
+
+
+def test_settings_come_on_top_of_the_file(tmp_path):
+    path = write(tmp_path / "c.yaml", "pairs: {window: 7, spread: 3}")
+    config = load_config(path, ("pairs.window=8", "matching.model=a=b.pt", "cameras.params='900,512,384'"))
+    assert (config.pairs.window, config.pairs.spread) == (8, 3)
+    assert config.matching.model == "a=b.pt"
+    assert config.cameras.params == "900,512,384"
+
+
+@pytest.mark.parametrize(
+    "setting", ["pairs.window", "=3", "window=3", "pairs.width=3", "pairs.window.x=3", "pairs.window=[", "pairs..x=1"]
+)
+def test_malformed_settings_are_refused(setting, tmp_path):
+    path = write(tmp_path / "c.yaml", "pairs: {window: 7}")
+    with pytest.raises(ConfigError):
+        load_config(path, (setting,))
+
+
+@pytest.mark.parametrize("text", ["- a\n- b", "42", "just text", "a: [", "a: b: c", "\x00"])
+def test_files_that_hold_no_configuration_are_refused(tmp_path, text):
+    path = write(tmp_path / "c.yaml", text)
+    with pytest.raises(ConfigError, match="c.yaml"):
+        load_config(path)
+
+
+def test_unreadable_files_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="absent.yaml"):
+        load_config(tmp_path / "absent.yaml")
+    with pytest.raises(ConfigError, match=tmp_path.name):
+        load_config(tmp_path)
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x81")
+    with pytest.raises(ConfigError, match="binary.yaml"):
+        load_config(tmp_path / "binary.yaml")
+
+
+@pytest.mark.parametrize("text", ["", "images: photos\nout: out"])
+def test_a_missing_key_without_default_is_named(tmp_path, text):
+    path = write(tmp_path / "train.yaml", text)
+    with pytest.raises(ConfigError, match="train.yaml lacks the key '(images|xfeat)'"):
+        load_config(path, cls=TrainConfig)
+
+
+def test_parsing_a_written_out_configuration_gives_it_back():
+    config = dataclasses.replace(Config(), network=NetworkConfig(window=17, radius=3))
+    assert parse_config(dataclasses.asdict(config), Config) == config
+
+
+@pytest.mark.parametrize("name, value", leaves(Config()), ids=lambda part: part if isinstance(part, str) else "")
+def test_the_fingerprint_changes_with_any_value(name, value):
+    other = {str: "other", int: 4711, float: 0.4711}[type(value)]
+    section, key = name.split(".")
+    changed = dataclasses.replace(
+        Config(), **{section: dataclasses.replace(getattr(Config(), section), **{key: other})}
+    )
+    assert fingerprint(changed) != fingerprint(Config())
+
+
+def test_fingerprints_are_stable_and_depend_on_all_parts():
+    assert fingerprint(Config()) == fingerprint(Config())
+    assert len({fingerprint(), fingerprint(1), fingerprint(1, 2), fingerprint([1, 2]), fingerprint(Path("a"))}) == 5
+    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
+    assert len(fingerprint(Config())) == 16

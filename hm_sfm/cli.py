@@ -10,6 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NoReturn
 
+from hm_sfm.atomic import replace_file
 from hm_sfm.config import Config, load_config
 from hm_sfm.errors import HmSfmError, InputError
 
@@ -94,6 +95,10 @@ def make_parser() -> argparse.ArgumentParser:
     command.add_argument("out", metavar="OUT", type=Path, help="folder for the photos and the model")
     command.set_defaults(run=run_demo)
 
+    text = "measure the matches of single pairs against known poses or homographies"
+    command = commands.add_parser("evaluate", parents=[quiet], help=text, description=text)
+    add_evaluate_options(command)
+
     text = "train the network's fine stage on a folder of photos"
     more = "The configuration names the photos, the output folder and the weights to start from."
     command = commands.add_parser("train", parents=[quiet], help=text, description=f"{text}. {more}")
@@ -103,6 +108,24 @@ def make_parser() -> argparse.ArgumentParser:
     add_settings(command, "steps=1000")
     command.set_defaults(run=run_train)
     return parser
+
+
+def add_evaluate_options(command: argparse.ArgumentParser) -> None:
+    """The options of evaluate."""
+    text = (
+        "poses: a folder in Strecha's layout (images/, gt_dense_cameras/, K.txt), or a file in SuperGlue's "
+        "pairs_with_gt format; homographies: a folder in HPatches' layout"
+    )
+    command.add_argument("task", metavar="TASK", choices=("poses", "homographies"), help="poses or homographies")
+    command.add_argument("data", metavar="DATA", type=Path, help=text)
+    command.add_argument("--images", metavar="DIR", type=Path, help="folder of the images that a pairs file names")
+    command.add_argument("--json", metavar="FILE", type=Path, help="write the figures to this file, too")
+    for flag, key, metavar, text in PHOTO_OPTIONS:
+        if key.startswith("matching."):
+            command.add_argument(flag, dest=key, metavar=metavar, help=text)
+    command.add_argument("--config", type=Path, metavar="FILE", help="YAML file of settings like configs/light.yaml")
+    add_settings(command, "matching.coarse_threshold=0.7")
+    command.set_defaults(run=run_evaluate)
 
 
 def add_photo_options(command: argparse.ArgumentParser) -> None:
@@ -162,9 +185,9 @@ def run_reconstruct(options: argparse.Namespace) -> int:
 
 
 def run_demo(options: argparse.Namespace) -> int:
+    from hm_sfm.demo import write_demo
     from hm_sfm.evaluation import read_strecha_cameras, score_model
     from hm_sfm.reconstruction import claim_folder, reconstruct
-    from hm_sfm.rendering import write_demo
 
     claim_folder(options.out)
     write_demo(options.out)
@@ -175,6 +198,29 @@ def run_demo(options: argparse.Namespace) -> int:
         f"against the truth: AUC@1 deg {score.auc_percent[1]:.1f}, AUC@3 deg {score.auc_percent[3]:.1f}, "
         f"median rotation error {score.median_rotation_deg:.3f} deg, translation {score.median_translation_deg:.3f} deg"
     )
+    return 0
+
+
+def run_evaluate(options: argparse.Namespace) -> int:
+    from hm_sfm.network.model import HomoMatcher
+    from hm_sfm.pair_evaluation import read_strecha_pairs, read_superglue_pairs, score_homographies, score_poses
+
+    config = read_config(options)
+    matcher = HomoMatcher.from_pretrained(
+        config.matching.model, config=config.matching, images=config.images, network=config.network
+    )
+    if options.task == "homographies":
+        scores = score_homographies(matcher, options.data, options.quiet)
+    elif options.data.is_file():
+        pairs = read_superglue_pairs(options.data, options.images or options.data.parent)
+        scores = score_poses(matcher, pairs, options.quiet)
+    else:
+        scores = score_poses(matcher, read_strecha_pairs(options.data), options.quiet)
+    for name, value in scores.items():
+        print(f"{name:24} {value:9.2f}")
+    if options.json:
+        with replace_file(options.json) as temporary:
+            temporary.write_text(json.dumps(scores, indent=2) + "\n")
     return 0
 
 

@@ -149,6 +149,8 @@ def _parse_value(value: Any, kind: Any, where: str) -> Any:
         return float(value)
     if type(value) is not kind:
         raise ConfigError(f"{where} must be of type {kind.__name__}, found {value!r}")
+    if kind in (int, float) and not value >= 0:
+        raise ConfigError(f"{where} must not be negative, found {value!r}")
     return value
 
 

@@ -45,6 +45,13 @@ def homography_to_pixel_index(homography_px: np.ndarray) -> np.ndarray:
     return back @ homography_px @ half
 
 
+def homography_from_pixel_index(homography: np.ndarray) -> np.ndarray:
+    """(..., 3, 3) homographies between OpenCV's indices (as data sets state them) -> the same between COLMAP px."""
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    back = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+    return half @ homography @ back
+
+
 def rotate_px(xy_px: np.ndarray, size_wh: tuple[int, int], rotation_deg: int) -> np.ndarray:
     """Carry points along when an image is turned clockwise.
 

@@ -81,9 +81,7 @@ def make_cameras(images: Sequence[ImageRef], config: CameraConfig) -> Cameras:
     return Cameras(tuple(cameras), tuple(camera_index))
 
 
-def _camera_keys(
-    images: Sequence[ImageRef], exif: Sequence[_ExifFocal], mode: str, known: bool
-) -> list[Hashable]:
+def _camera_keys(images: Sequence[ImageRef], exif: Sequence[_ExifFocal], mode: str, known: bool) -> list[Hashable]:
     """Per image, what it must have in common with another to share its camera."""
     folders = [PurePosixPath(image.name).parent for image in images]
     if mode == "single":

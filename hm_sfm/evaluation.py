@@ -1,6 +1,5 @@
 """How good a model is: its poses against the truth, as the field reports them (AUC of pose errors)."""
 
-import os
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from hm_sfm.atomic import replace_file
 from hm_sfm.errors import InputError
 from hm_sfm.types import PinholeView
 
@@ -67,10 +67,8 @@ def write_strecha_cameras(folder: Path, views: dict[str, PinholeView]) -> None:
         k[:2, 2] -= 0.5
         rows = [*k, np.zeros(3), *view.cam_from_world[:, :3].T, view.center]
         lines = [" ".join(repr(float(value)) for value in row) for row in rows]
-        path = Path(folder) / f"{name}.camera"
-        partial = path.with_name(path.name + ".partial")
-        partial.write_text("\n".join([*lines, f"{view.size_wh[0]} {view.size_wh[1]}"]) + "\n")
-        os.replace(partial, path)
+        with replace_file(Path(folder) / f"{name}.camera") as temporary:
+            temporary.write_text("\n".join([*lines, f"{view.size_wh[0]} {view.size_wh[1]}"]) + "\n")
 
 
 def compare_poses(reconstruction: pycolmap.Reconstruction, truth: dict[str, PinholeView]) -> np.ndarray:
@@ -171,23 +169,28 @@ def _measure_relative_errors(
         if name0 not in poses or name1 not in poses:
             errors.append((np.inf, np.inf))
             continue
-        found = _relative_pose(poses[name0], poses[name1])
-        true = _relative_pose(truth[name0].cam_from_world, truth[name1].cam_from_world)
-        # The chord, unlike the trace, keeps its precision at small angles.
-        chord = np.linalg.norm(found[:, :3] - true[:, :3]) / np.sqrt(8)
-        rotation_deg = np.degrees(2 * np.arcsin(min(chord, 1.0)))
-        errors.append((rotation_deg, _measure_angle_deg(found[:, 3], true[:, 3])))
+        found = relative_pose(poses[name0], poses[name1])
+        true = relative_pose(truth[name0].cam_from_world, truth[name1].cam_from_world)
+        errors.append((measure_rotation_deg(found[:, :3], true[:, :3]), measure_angle_deg(found[:, 3], true[:, 3])))
     rotation_deg, translation_deg = np.array(errors).T
     return rotation_deg, translation_deg
 
 
-def _relative_pose(cam0_from_world: np.ndarray, cam1_from_world: np.ndarray) -> np.ndarray:
+def relative_pose(cam0_from_world: np.ndarray, cam1_from_world: np.ndarray) -> np.ndarray:
     """(3, 4): cam1_from_cam0."""
     rotation = cam1_from_world[:, :3] @ cam0_from_world[:, :3].T
     return np.column_stack([rotation, cam1_from_world[:, 3] - rotation @ cam0_from_world[:, 3]])
 
 
-def _measure_angle_deg(found: np.ndarray, true: np.ndarray) -> float:
+def measure_rotation_deg(found: np.ndarray, true: np.ndarray) -> float:
+    """Angle in degrees of the rotation between two rotation matrices (3, 3)."""
+    # The chord, unlike the trace, keeps its precision at small angles.
+    chord = np.linalg.norm(found - true) / np.sqrt(8)
+    return float(np.degrees(2 * np.arcsin(min(chord, 1.0))))
+
+
+def measure_angle_deg(found: np.ndarray, true: np.ndarray) -> float:
+    """Angle in degrees between two directions (3,); 0 where there is no true one, 180 where none was found."""
     if not true.any():
         return 0.0
     if not found.any():

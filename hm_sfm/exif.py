@@ -3,12 +3,13 @@
 Only writing: reading EXIF is pycolmap's job.
 """
 
-import os
 import struct
 from pathlib import Path
 
 import cv2
 import numpy as np
+
+from hm_sfm.atomic import replace_file
 
 # Types of EXIF values and the tags used, by their numbers in the EXIF 2.3 standard.
 SHORT, LONG = 3, 4
@@ -39,10 +40,8 @@ def write_jpeg(
     _, encoded = cv2.imencode(".jpg", image_rgb[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     jpeg = encoded.tobytes()
     start_of_image, rest = jpeg[:2], jpeg[2:]
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_bytes(start_of_image + _exif_segment(focal_35mm, orientation) + rest)
-    os.replace(temporary, path)
+    with replace_file(path) as temporary:
+        temporary.write_bytes(start_of_image + _exif_segment(focal_35mm, orientation) + rest)
 
 
 def _exif_segment(focal_35mm: float | None, orientation: int) -> bytes:

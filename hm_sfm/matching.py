@@ -66,7 +66,9 @@ def match_pairs(
     batch: list[PairMatches] = []
     with (
         tqdm(total=len(names), desc="features", unit="image", disable=quiet or not names) as images_bar,
-        tqdm(total=len(pairs), initial=len(pairs) - len(missing), desc="matches", unit="pair", disable=quiet) as pairs_bar,
+        tqdm(
+            total=len(pairs), initial=len(pairs) - len(missing), desc="matches", unit="pair", disable=quiet
+        ) as pairs_bar,
     ):
         cache = FeatureCache(images, matcher, matcher.config.feature_cache_mb, images_bar)
         try:

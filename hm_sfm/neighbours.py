@@ -3,7 +3,9 @@
 import numpy as np
 
 
-def find_pairs_within(queries: np.ndarray, points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def find_pairs_within(
+    queries: np.ndarray, points: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """All (query, point) pairs at most `radius` apart.
 
     queries: (Q, 2), points: (N, 2), any float dtype, same unit as radius > 0. Returns query_index (P,) int64 ascending,

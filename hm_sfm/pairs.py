@@ -1,11 +1,11 @@
 """Stage 2: which images to match with which."""
 
 import itertools
-import os
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from hm_sfm.atomic import replace_file
 from hm_sfm.config import PairConfig
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.types import ImagePair
@@ -138,11 +138,9 @@ def write_pairs(path: Path, pairs: Iterable[ImagePair]) -> None:
 
     Raises InputError where a name holds a line break.
     """
-    path = Path(path)
     lines = [f"{_quote(pair.name0)} {_quote(pair.name1)}\n" for pair in pairs]
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes("".join(lines).encode())
-    os.replace(temporary, path)
+    with replace_file(path) as temporary:
+        temporary.write_bytes("".join(lines).encode())
 
 
 def _parse_line(line: str, where: str) -> tuple[str, str]:

@@ -5,7 +5,6 @@ Each function runs the chain up to its stage and picks up what an earlier run le
 
 import dataclasses
 import json
-import os
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from hm_sfm.atomic import replace_file
 from hm_sfm.config import Config, fingerprint
 from hm_sfm.database import Cameras, make_cameras, write_database
 from hm_sfm.errors import InputError, NoModelError
@@ -210,9 +210,8 @@ def write_summary(path: Path, result: MappingResult, matched: Matched, config: C
         "version": version("hm_sfm"),
         "config_fingerprint": fingerprint(config),
     }
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(figures, indent=2) + "\n")
-    os.replace(temporary, path)
+    with replace_file(path) as temporary:
+        temporary.write_text(json.dumps(figures, indent=2) + "\n")
 
 
 @contextmanager

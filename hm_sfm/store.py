@@ -7,7 +7,6 @@ every file that of the configuration and the weights, so nothing stale is ever u
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from hm_sfm.atomic import replace_file
 from hm_sfm.errors import InputError, StaleResultError
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
@@ -71,12 +71,10 @@ class MatchStore:
         self.parts.mkdir(parents=True, exist_ok=True)
         last = max((int(path.stem) for path in self.parts.glob("*.h5")), default=-1)
         path = self.parts / f"{last + 1:06d}.h5"
-        temporary = path.with_suffix(".tmp")
-        with h5py.File(temporary, "w") as h5:
+        with replace_file(path) as temporary, h5py.File(temporary, "w") as h5:
             self._stamp(h5)
             for number, matches in enumerate(batch):
                 self._write_pair(h5, f"{number:06d}", matches)
-        os.replace(temporary, path)
         for number, matches in enumerate(batch):
             self._where[matches.pair] = (path, f"{number:06d}")
 
@@ -84,9 +82,8 @@ class MatchStore:
         """Gather everything that is still valid in matches.h5 and remove the batches."""
         if not self.parts.exists() and self.path.exists():
             return
-        temporary = self.path.with_suffix(".tmp")
         where = {}
-        with h5py.File(temporary, "w") as merged:
+        with replace_file(self.path) as temporary, h5py.File(temporary, "w") as merged:
             self._stamp(merged)
             by_file: dict[Path, list[ImagePair]] = {}
             for pair, (file, _) in self._where.items():
@@ -97,7 +94,6 @@ class MatchStore:
                         group = f"{len(where):06d}"
                         h5.copy(self._where[pair][1], merged, group)
                         where[pair] = (self.path, group)
-        os.replace(temporary, self.path)
         self._where = where
         shutil.rmtree(self.parts, ignore_errors=True)
 

@@ -8,7 +8,9 @@ import numpy as np
 from hm_sfm.types import Tracks
 
 
-def label_tracks(count: int, source: np.ndarray, target: np.ndarray, score: np.ndarray, image: np.ndarray) -> np.ndarray:
+def label_tracks(
+    count: int, source: np.ndarray, target: np.ndarray, score: np.ndarray, image: np.ndarray
+) -> np.ndarray:
     """Number the track of every keypoint, so that no track holds two keypoints of one image.
 
     count: K keypoints; source, target: (E,) int64 matched keypoints; score: (E,) float, higher is stronger;

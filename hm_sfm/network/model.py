@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hm_sfm.atomic import replace_file
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, parse_config
 from hm_sfm.coordinates import Grid
 from hm_sfm.errors import ConfigError, WeightsError
@@ -221,9 +221,8 @@ def pick_device(name: str) -> torch.device:
 
 def save_weights(path: Path, net: HomoNet) -> None:
     """Write the network's configuration and weights; atomic."""
-    temporary = Path(path).with_name(Path(path).name + ".part")
-    torch.save({"network": dataclasses.asdict(net.config), "state_dict": net.state_dict()}, temporary)
-    os.replace(temporary, path)
+    with replace_file(path) as temporary:
+        torch.save({"network": dataclasses.asdict(net.config), "state_dict": net.state_dict()}, temporary)
 
 
 def find_weights(name: str) -> Path:
@@ -254,12 +253,16 @@ def load_weights(name: str, network: NetworkConfig | None = None) -> HomoNet:
         made_for = parse_config(content["network"], NetworkConfig, str(path))
         state_dict = content["state_dict"]
     except Exception as error:
-        raise WeightsError(f"{path} is damaged or no hm_sfm weights file: {' '.join(str(error).split())[:200]}") from error
+        raise WeightsError(
+            f"{path} is damaged or no hm_sfm weights file: {' '.join(str(error).split())[:200]}"
+        ) from error
     wanted = network or made_for
     for field in dataclasses.fields(NetworkConfig):
         found, asked = getattr(made_for, field.name), getattr(wanted, field.name)
         if field.name != "iterations" and found != asked:
-            raise WeightsError(f"{path} was trained with network.{field.name} {found!r}, the configuration has {asked!r}")
+            raise WeightsError(
+                f"{path} was trained with network.{field.name} {found!r}, the configuration has {asked!r}"
+            )
     net = HomoNet(wanted)
     try:
         net.load_state_dict(state_dict)

@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import logging
 import math
-import os
 import time
 from collections.abc import Iterator
 from contextlib import nullcontext
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
+from hm_sfm.atomic import replace_file
 from hm_sfm.config import NetworkConfig, fingerprint
 from hm_sfm.errors import ConfigError, HmSfmError, WeightsError
 from hm_sfm.network.backbone import load_xfeat
@@ -99,7 +99,8 @@ def train(config: TrainConfig, resume: bool = False, quiet: bool = False) -> Pat
             if state.step % config.validate_every == 0 or done:
                 scores = validate(state.average, held_out, config, device)
                 append_row(out / "validation.csv", {"step": state.step} | scores)
-                progress.write(f"step {state.step}: " + ", ".join(f"{k} {v:.3f}" for k, v in scores.items()))
+                if not quiet:
+                    progress.write(f"step {state.step}: " + ", ".join(f"{k} {v:.3f}" for k, v in scores.items()))
             if time.monotonic() - saved_at > config.checkpoint_seconds or done:
                 save_checkpoint(checkpoint, config, state)
                 save_weights(out / "weights.pt", state.average)
@@ -225,9 +226,8 @@ def save_checkpoint(path: Path, config: TrainConfig, state: TrainState) -> None:
         "average": state.average.state_dict(),
         "optimizer": state.optimizer.state_dict(),
     }
-    temporary = path.with_name(path.name + ".part")
-    torch.save(content, temporary)
-    os.replace(temporary, path)
+    with replace_file(path) as temporary:
+        torch.save(content, temporary)
 
 
 def load_checkpoint(path: Path, config: TrainConfig, state: TrainState) -> None:
@@ -256,9 +256,8 @@ def drop_rows_after(path: Path, step: int) -> None:
         return
     lines = path.read_text().splitlines(keepends=True)
     kept = lines[:1] + [row for row in lines[1:] if int(row.split(",")[0]) <= step]
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text("".join(kept))
-    os.replace(temporary, path)
+    with replace_file(path) as temporary:
+        temporary.write_text("".join(kept))
 
 
 def append_row(path: Path, row: dict) -> None:

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from hm_sfm.cli import main
+from hm_sfm.demo import write_demo
 from hm_sfm.network.model import HomoMatcher
-from hm_sfm.rendering import write_demo
 from hm_sfm.types import PinholeView
 
 

@@ -12,7 +12,7 @@ from PIL import Image
 
 import hm_sfm.network.model as model
 from hm_sfm.images import list_images, prepare_image
-from hm_sfm.rendering import make_texture
+from hm_sfm.textures import make_texture
 
 
 def assert_refused(finished, *parts: object, code: int = 2) -> None:

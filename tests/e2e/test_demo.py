@@ -12,9 +12,9 @@ import numpy as np
 import pycolmap
 import pytest
 
+from hm_sfm.demo import write_demo
 from hm_sfm.evaluation import ModelScore, read_strecha_cameras, score_model
 from hm_sfm.pairs import read_pairs
-from hm_sfm.rendering import write_demo
 
 # A process that stores each pair at once instead of every 20 s, and that minds Ctrl-C even where the tests were
 # started in the background.

@@ -90,6 +90,12 @@ def test_a_value_of_another_type_is_refused(setting):
     assert section in str(error.value) and key in str(error.value)
 
 
+@pytest.mark.parametrize("setting", ["matching.max_matches=-1", "keypoints.join_radius_px=-0.5", "mapping.seed=-1"])
+def test_negative_values_are_refused(setting):
+    with pytest.raises(ConfigError, match="must not be negative"):
+        load_config(settings=(setting,))
+
+
 def test_settings_come_on_top_of_the_file(tmp_path):
     path = write(tmp_path / "c.yaml", "pairs: {window: 7, spread: 3}")
     config = load_config(path, ("pairs.window=8", "matching.model=a=b.pt", "cameras.params='900,512,384'"))

@@ -74,7 +74,9 @@ def test_expectation_head_is_unsure_of_a_flat_patch():
 
 
 @pytest.mark.parametrize("head", ["homography", "expectation"])
-@pytest.mark.parametrize("field, value", [("window", 8), ("window", 3), ("radius", -1), ("iterations", 0), ("margin", -1)])
+@pytest.mark.parametrize(
+    "field, value", [("window", 8), ("window", 3), ("radius", -1), ("iterations", 0), ("margin", -1)]
+)
 def test_impossible_networks_are_refused(head, field, value):
     with pytest.raises(ConfigError, match=f"network.{field}"):
         HomoNet(NetworkConfig(**{"head": head, field: value}))

@@ -80,7 +80,6 @@ def test_damaged_files_are_refused(tmp_path, small_net, spoil):
     [
         pytest.param({}, id="nothing in it"),
         pytest.param([1, 2], id="a list"),
-        pytest.param(torch.zeros(3), id="a tensor"),
         pytest.param({"conv.weight": torch.zeros(3)}, id="another network's"),
         pytest.param({"network": {"depth": 3}, "state_dict": {}}, id="an unknown configuration"),
         pytest.param({"network": {}, "state_dict": {}}, id="no tensors"),
@@ -277,7 +276,7 @@ def test_scores_are_probabilities_of_less_than_a_pixel():
 
 
 def two_patches() -> PatchMatches:
-    """Patches around (10.5, 10.5) and (20.5, 10.5): the first shifts by (100, 0), the second doubles about its centre."""
+    """Patches around (10.5, 10.5), which shifts by (100, 0), and (20.5, 10.5), which doubles about its centre."""
     shift = np.array([[1, 0, 100], [0, 1, 0], [0, 0, 1]])
     double = np.array([[2, 0, -20.5], [0, 2, -10.5], [0, 0, 1]])
     return PatchMatches(

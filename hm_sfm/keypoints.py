@@ -177,7 +177,8 @@ def predict_points(
     point, slot = np.unique(at, return_inverse=True)
     homography = carrier.homography[patch]
     says = apply_homographies(homography, xy[at]).astype(np.float64)
-    prior = carrier.score[patch] * (1.05 - distance / radius)
+    # The floor keeps means defined where a foreign matcher gives scores of zero.
+    prior = np.maximum(carrier.score[patch], 1e-3) * (1.05 - distance / radius)
     trust = prior
     for _ in range(AGREEMENT_ROUNDS):
         predicted = mean_in_groups(says, slot, trust, len(point))

@@ -20,7 +20,7 @@ class FeatureMaps:
     """Features of a batch of images, with the grids that say where their cells sit."""
 
     coarse: Tensor
-    """(B, Cc, H/8, W/8), unit length per cell."""
+    """(B, Cc, H/8, W/8)."""
     fine: Tensor
     """(B, Cf, H/2, W/2)."""
 
@@ -91,6 +91,8 @@ class LightBackbone(nn.Module):
 
     stride = 32
     """Images are padded right and bottom to a multiple of this."""
+    standardised = True
+    """Images come with zero mean and unit variance; otherwise in [0, 1]."""
     coarse_grid = Grid(stride=8, offset=4.0)
     fine_grid = Grid(stride=2, offset=1.0)
     fine_channels = 48
@@ -104,8 +106,7 @@ class LightBackbone(nn.Module):
         """image: (B, 1, H, W) float32 of zero mean and unit variance, H and W multiples of `stride`."""
         image = image.contiguous(memory_format=torch.channels_last)
         quarter, eighth = self.trunk(image)
-        coarse = F.normalize(eighth.float(), dim=1)
-        return FeatureMaps(coarse=coarse, fine=self.fine(image, quarter, eighth))
+        return FeatureMaps(coarse=eighth, fine=self.fine(image, quarter, eighth))
 
 
 def load_xfeat(trunk: XFeatTrunk, path: Path) -> None:

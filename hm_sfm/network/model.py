@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hm_sfm.atomic import replace_file
@@ -15,9 +16,10 @@ from hm_sfm.coordinates import Grid
 from hm_sfm.errors import ConfigError, WeightsError
 from hm_sfm.images import PreparedImage, prepare_array, prepare_image, read_ref
 from hm_sfm.network.backbone import LightBackbone
-from hm_sfm.network.coarse import match_cells
+from hm_sfm.network.coarse import CosineCoarse, LoftrCoarse
 from hm_sfm.network.fine import ExpectationHead, FineMap, HomographyHead, make_fine_map
 from hm_sfm.network.homography import is_regular
+from hm_sfm.network.resnet import LoftrBackbone
 from hm_sfm.types import PatchMatches
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
@@ -26,7 +28,7 @@ FINE_CHUNK = 512
 
 
 class HomoNet(nn.Module):
-    """Backbone and fine head. The parts are called one by one: features once per image, the head per pair.
+    """Backbone, coarse stage and fine head. The parts are called one by one: features once per image, the rest per pair.
 
     Raises ConfigError where the configuration names no known backbone or head, or an impossible size.
     """
@@ -39,9 +41,12 @@ class HomoNet(nn.Module):
         for field, least in (("radius", 0), ("iterations", 1), ("margin", 0)):
             if getattr(config, field) < least:
                 raise ConfigError(f"network.{field} must be at least {least}, found {getattr(config, field)}")
-        if config.backbone != "light":
-            raise ConfigError(f"network.backbone must be light, found {config.backbone!r}")
-        self.backbone = LightBackbone()
+        if config.backbone == "light":
+            self.backbone, self.coarse = LightBackbone(), CosineCoarse()
+        elif config.backbone == "loftr":
+            self.backbone, self.coarse = LoftrBackbone(), LoftrCoarse()
+        else:
+            raise ConfigError(f"network.backbone must be light or loftr, found {config.backbone!r}")
         if config.head == "homography":
             self.head = HomographyHead(config.window, config.radius, config.iterations, config.margin)
         elif config.head == "expectation":
@@ -49,13 +54,18 @@ class HomoNet(nn.Module):
         else:
             raise ConfigError(f"network.head must be homography or expectation, found {config.head!r}")
 
+    @property
+    def frozen(self) -> list[nn.Module]:
+        """The parts that come from public weights and stay as they are when the fine stage is trained."""
+        return [self.backbone.trunk] if self.config.backbone == "light" else [self.backbone, self.coarse]
+
 
 @dataclass(frozen=True)
 class ImageFeatures:
     """Features of one image, ready to be matched with any other's."""
 
     coarse: Tensor
-    """(N, C) float32, unit rows: the 1/8 cells whose centre lies in the image."""
+    """(N, C) float32, as the coarse stage describes them: the 1/8 cells whose centre lies in the image."""
     cell: Tensor
     """(N, 2) int64: their grid positions (x, y)."""
     fine: FineMap
@@ -106,14 +116,15 @@ class HomoMatcher:
     def encode(self, image: PreparedImage) -> ImageFeatures:
         """Features of a prepared image."""
         backbone = self.net.backbone
-        pixels = normalise_image(torch.tensor(image.grey, device=self.device), backbone.stride)
+        pixels = pad_image(torch.tensor(image.grey, device=self.device), backbone.stride, backbone.standardised)
         with autocast(self.device):
             maps = backbone(pixels)
+        coarse = self.net.coarse.describe(maps.coarse)
         columns = count_cells(image.scaled_wh[0], backbone.coarse_grid)
         rows = count_cells(image.scaled_wh[1], backbone.coarse_grid)
         y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
         return ImageFeatures(
-            coarse=maps.coarse[0, :, :rows, :columns].flatten(1).T.contiguous(),
+            coarse=coarse[0, :, :rows, :columns].flatten(1).T.contiguous(),
             cell=torch.stack([x, y], dim=-1).reshape(-1, 2).to(self.device),
             fine=make_fine_map(maps.fine),
             scaled_wh=image.scaled_wh,
@@ -124,8 +135,9 @@ class HomoMatcher:
     def match_features(self, features0: ImageFeatures, features1: ImageFeatures) -> PatchMatches:
         """Match two images by their features; coordinates are px of the stored images."""
         backbone, head = self.net.backbone, self.net.head
-        index0, index1, similarity = match_cells(features0.coarse, features1.coarse, self.config.coarse_threshold)
-        best = similarity.argsort(descending=True, stable=True)[: self.config.max_matches]
+        threshold = self.config.coarse_threshold
+        index0, index1, confidence = self.net.coarse.match(features0.coarse, features1.coarse, threshold)
+        best = confidence.argsort(descending=True, stable=True)[: self.config.max_matches]
         cell0 = fine_cell_of(features0.cell[index0[best]], backbone.coarse_grid, backbone.fine_grid)
         cell1 = fine_cell_of(features1.cell[index1[best]], backbone.coarse_grid, backbone.fine_grid)
         estimates = []
@@ -162,13 +174,15 @@ class HomoMatcher:
         )
 
 
-def normalise_image(grey: Tensor, stride: int) -> Tensor:
-    """(H, W) float32 of any range -> (1, 1, H', W') of zero mean and unit variance, zero-padded right and bottom."""
-    deviation = grey.std().clamp_min(1e-3)
+def pad_image(grey: Tensor, stride: int, standardise: bool) -> Tensor:
+    """(H, W) float32 in [0, 1] -> (1, 1, H', W'), zero-padded right and bottom to multiples of `stride`.
+
+    standardise: to zero mean and unit variance first.
+    """
+    if standardise:
+        grey = (grey - grey.mean()) / grey.std().clamp_min(1e-3)
     height, width = grey.shape
-    padded = grey.new_zeros(1, 1, -(-height // stride) * stride, -(-width // stride) * stride)
-    padded[..., :height, :width] = (grey - grey.mean()) / deviation
-    return padded
+    return F.pad(grey[None, None], (0, -width % stride, 0, -height % stride))
 
 
 def count_cells(size_px: int, grid: Grid) -> int:
@@ -248,14 +262,20 @@ def load_weights(name: str, network: NetworkConfig | None = None) -> HomoNet:
     path = find_weights(name)
     if path.parent == WEIGHTS_FOLDER:
         check_digest(path)
+    content = read_checkpoint(path)
+    if "network" not in content and network is not None and network.backbone == "loftr":
+        if network.head != "expectation":
+            raise WeightsError(
+                f"{path} has no homography head: train one with hm-sfm train, or take network.head expectation"
+            )
+        net = HomoNet(network)
+        load_loftr(net, path)
+        return net
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
         made_for = parse_config(content["network"], NetworkConfig, str(path))
         state_dict = content["state_dict"]
-    except Exception as error:
-        raise WeightsError(
-            f"{path} is damaged or no hm_sfm weights file: {' '.join(str(error).split())[:200]}"
-        ) from error
+    except (KeyError, ConfigError) as error:
+        raise WeightsError(f"{path} is damaged or no hm_sfm weights file: {error}") from error
     wanted = network or made_for
     for field in dataclasses.fields(NetworkConfig):
         found, asked = getattr(made_for, field.name), getattr(wanted, field.name)
@@ -264,11 +284,42 @@ def load_weights(name: str, network: NetworkConfig | None = None) -> HomoNet:
                 f"{path} was trained with network.{field.name} {found!r}, the configuration has {asked!r}"
             )
     net = HomoNet(wanted)
+    fit_state(net, state_dict, path)
+    return net
+
+
+def load_loftr(net: HomoNet, path: Path) -> None:
+    """Put backbone and coarse stage of a public LoFTR checkpoint into a `loftr` network, by name.
+
+    Raises WeightsError where the file is damaged, or keys are missing or of another shape.
+    """
+    content = read_checkpoint(path)
+    source = {key.removeprefix("matcher."): value for key, value in content.get("state_dict", content).items()}
+    for part, prefix in ((net.backbone, "backbone."), (net.coarse, "loftr_coarse.")):
+        fit_state(
+            part, {key.removeprefix(prefix): value for key, value in source.items() if key.startswith(prefix)}, path
+        )
+
+
+def read_checkpoint(path: Path) -> dict:
+    """The content of a weights file or LoFTR checkpoint. Raises WeightsError where it is damaged or no dictionary."""
     try:
-        net.load_state_dict(state_dict)
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise WeightsError(
+            f"{path} is damaged or no hm_sfm weights file: {' '.join(str(error).split())[:200]}"
+        ) from error
+    if not isinstance(content, dict):
+        raise WeightsError(f"{path} is damaged or no hm_sfm weights file: it holds a {type(content).__name__}")
+    return content
+
+
+def fit_state(module: nn.Module, state: dict[str, Tensor], path: Path) -> None:
+    """load_state_dict. Raises WeightsError that names a missing, unexpected or misshapen key."""
+    try:
+        module.load_state_dict(state)
     except (RuntimeError, TypeError) as error:
         raise WeightsError(f"{path} does not fit the network: {' '.join(str(error).split())[:300]}") from error
-    return net
 
 
 def check_digest(path: Path) -> None:

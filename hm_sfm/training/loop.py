@@ -20,7 +20,7 @@ from hm_sfm.config import NetworkConfig, fingerprint
 from hm_sfm.errors import ConfigError, HmSfmError, WeightsError
 from hm_sfm.network.backbone import load_xfeat
 from hm_sfm.network.fine import make_fine_map
-from hm_sfm.network.model import HomoNet, pick_device, save_weights
+from hm_sfm.network.model import HomoNet, load_loftr, pick_device, save_weights
 from hm_sfm.training.losses import measure_errors, measure_loss
 from hm_sfm.training.photos import WarpedPhotos, WarpRange, load_photos, split_photos
 from hm_sfm.training.supervision import PatchSupervision, draw_patches
@@ -36,8 +36,8 @@ class TrainConfig:
     """Folder of photos, searched with its subfolders."""
     out: str
     """Folder for checkpoint.pt, weights.pt, log.csv and validation.csv."""
-    xfeat: str
-    """XFeat's weights file, which the trunk starts from."""
+    start_from: str
+    """Public weights of the frozen parts: XFeat's file for the backbone `light`, a LoFTR checkpoint for `loftr`."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     warp: WarpRange = field(default_factory=WarpRange)
     steps: int = 8000
@@ -50,7 +50,7 @@ class TrainConfig:
     average_decay: float = 0.998
     """Of the exponential moving average of the weights, which is what is validated and exported."""
     precision: str = "auto"
-    """auto (bf16 on the CPU; bf16 or fp16 on CUDA) | fp32."""
+    """auto (bf16 for convolutions and matrix products) | fp32."""
     device: str = "auto"
     validate_every: int = 500
     checkpoint_seconds: float = 120.0
@@ -75,6 +75,8 @@ def train(config: TrainConfig, resume: bool = False, quiet: bool = False) -> Pat
     """
     out = Path(config.out)
     checkpoint = out / "checkpoint.pt"
+    if config.precision not in ("auto", "fp32"):
+        raise ConfigError(f"precision must be auto or fp32, found {config.precision!r}")
     if checkpoint.exists() and not resume:
         raise ConfigError(f"{out} already holds a training: go on with --resume, or name another folder")
     training, validation = split_photos(load_photos(Path(config.images)))
@@ -109,11 +111,15 @@ def train(config: TrainConfig, resume: bool = False, quiet: bool = False) -> Pat
 
 
 def make_state(config: TrainConfig, device: torch.device) -> TrainState:
-    """Network, its average and the optimizer at step 0. The trunk starts from XFeat and stays frozen."""
+    """Network, its average and the optimizer at step 0; the parts that come from public weights are frozen."""
     torch.manual_seed(config.seed)
     net = HomoNet(config.network).to(device)
-    load_xfeat(net.backbone.trunk, Path(config.xfeat))
-    net.backbone.trunk.requires_grad_(False)
+    if config.network.backbone == "light":
+        load_xfeat(net.backbone.trunk, Path(config.start_from))
+    else:
+        load_loftr(net, Path(config.start_from))
+    for part in net.frozen:
+        part.requires_grad_(False)
     average = HomoNet(config.network).to(device)
     average.load_state_dict(net.state_dict())
     average.eval().requires_grad_(False)
@@ -135,7 +141,8 @@ def train_step(state: TrainState, batch: dict[str, Tensor], config: TrainConfig,
         group["lr"] = rate
     generator = torch.Generator().manual_seed(config.seed * 1_000_003 + state.step)
     state.net.train()
-    state.net.backbone.trunk.eval()
+    for part in state.net.frozen:
+        part.eval()
     estimates, truth = run_pairs(state.net, batch, config, device, generator)
     parts = measure_loss(estimates, truth, state.net.head.half)
     loss = parts["loss"]
@@ -167,9 +174,10 @@ def run_pairs(
         generator,
     )
     truth = PatchSupervision(*(getattr(truth, f.name).to(device) for f in dataclasses.fields(truth)))
-    images = batch["images"].to(device).float()
-    images = images - images.mean(dim=(2, 3), keepdim=True)
-    images = images / images.std(dim=(2, 3), keepdim=True).clamp_min(1.0)
+    images = batch["images"].to(device).float() / 255
+    if backbone.standardised:
+        images = images - images.mean(dim=(2, 3), keepdim=True)
+        images = images / images.std(dim=(2, 3), keepdim=True).clamp_min(1 / 255)
     with autocast(config.precision, device):
         fine = backbone(images.flatten(0, 1)[:, None]).fine.unflatten(0, (-1, 2))
         maps0, maps1 = make_fine_map(fine[:, 0]), make_fine_map(fine[:, 1])
@@ -247,7 +255,7 @@ def load_checkpoint(path: Path, config: TrainConfig, state: TrainState) -> None:
 
 def run_fingerprint(config: TrainConfig) -> str:
     """Fingerprint of what shapes the run; where things lie and how often they are saved does not."""
-    return fingerprint(dataclasses.replace(config, images="", out="", xfeat="", checkpoint_seconds=0.0, device=""))
+    return fingerprint(dataclasses.replace(config, images="", out="", start_from="", checkpoint_seconds=0.0, device=""))
 
 
 def drop_rows_after(path: Path, step: int) -> None:

@@ -51,7 +51,7 @@ def draw_patches(
     coarse0 = torch.randint(cells, (batch, per_pair, 2), generator=generator)
     centre0_px = coarse_grid.to_px(coarse0.float())
     centre1_px = apply_homography(b_from_a, centre0_px)
-    coarse1 = torch.floor(centre1_px / coarse_grid.stride).long()
+    coarse1 = torch.floor(coarse_grid.from_px(centre1_px) + 0.5).long()
     jitter = torch.randint(-1, 2, (batch, per_pair, 2), generator=generator)
     kind = torch.rand(batch, per_pair, 1, generator=generator)
     anywhere = torch.randint(cells, (batch, per_pair, 2), generator=generator)

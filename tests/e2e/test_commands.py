@@ -7,6 +7,7 @@ import subprocess
 import sys
 from importlib.metadata import entry_points, version
 
+import numpy as np
 import pycolmap
 import pytest
 import torch
@@ -14,9 +15,10 @@ import yaml
 
 import hm_sfm
 from hm_sfm.cli import main, make_parser
+from hm_sfm.evaluation import write_strecha_cameras
 from hm_sfm.network.backbone import XFeatTrunk
 
-COMMANDS = ("reconstruct", "match", "export", "demo", "train")
+COMMANDS = ("reconstruct", "match", "export", "demo", "evaluate", "train")
 
 
 def test_the_installed_command_is_main():
@@ -128,6 +130,25 @@ def test_settings_come_from_the_file_then_set_then_options(scene, out, tmp_path,
     assert [camera.model for camera in cameras] == [pycolmap.CameraModelId.OPENCV] * 5
 
 
+def test_evaluate_scores_the_poses_of_a_scene(scene, tmp_path, run):
+    shutil.copytree(scene.images, tmp_path / "images")
+    write_strecha_cameras(tmp_path / "gt_dense_cameras", scene.views)
+    np.savetxt(tmp_path / "K.txt", next(iter(scene.views.values())).K)
+    finished = run("evaluate", "poses", tmp_path, "--json", tmp_path / "scores.json", "--quiet")
+    assert finished.code == 0, finished.err
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert scores["mean_matches"] > 100
+    assert scores["opencv_auc_5deg"] > 50 and scores["colmap_auc_5deg"] > 50
+    assert all(name in finished.out for name in scores)
+
+
+def test_evaluate_refuses_a_folder_without_truth(scene, run):
+    for task in ("poses", "homographies"):
+        finished = run("evaluate", task, scene.images)
+        assert finished.code == 2
+        assert finished.err.startswith("hm-sfm: ") and str(scene.images) in finished.err
+
+
 def test_train_makes_weights_that_match_uses(scene, tmp_path, run, read_matches):
     torch.manual_seed(0)
     torch.save(XFeatTrunk().state_dict(), tmp_path / "xfeat.pt")
@@ -135,7 +156,7 @@ def test_train_makes_weights_that_match_uses(scene, tmp_path, run, read_matches)
     settings = {
         "images": str(scene.images),
         "out": str(tmp_path / "training"),
-        "xfeat": str(tmp_path / "xfeat.pt"),
+        "start_from": str(tmp_path / "xfeat.pt"),
         "steps": 1,
         "pairs_per_step": 1,
         "patches_per_pair": 16,

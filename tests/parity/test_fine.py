@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig
 from hm_sfm.images import prepare_array
 from hm_sfm.network import model
-from hm_sfm.network.coarse import match_cells
+from hm_sfm.network.coarse import match_by_similarity
 from hm_sfm.network.fine import (
     ExpectationHead,
     HomographyHead,
@@ -111,7 +111,7 @@ def match_naively(coarse0: torch.Tensor, coarse1: torch.Tensor, threshold: float
 def test_cells_match_as_mutual_nearest_neighbours_of_the_whole_matrix(block, generator):
     coarse0 = F.normalize(torch.randn(50, 8, generator=generator), dim=1)
     coarse1 = F.normalize(torch.randn(61, 8, generator=generator), dim=1)
-    index0, index1, similarity = match_cells(coarse0, coarse1, 0.3, block)
+    index0, index1, similarity = match_by_similarity(coarse0, coarse1, 0.3, block)
     # The naive form multiplies whole matrices: sums differ in the last bit, nearest neighbours do not.
     assert set(zip(index0.tolist(), index1.tolist())) == match_naively(coarse0, coarse1, 0.3)
     assert len(index0) > 10
@@ -120,7 +120,7 @@ def test_cells_match_as_mutual_nearest_neighbours_of_the_whole_matrix(block, gen
 
 def test_a_threshold_that_nothing_meets_matches_nothing(generator):
     coarse = F.normalize(torch.randn(9, 8, generator=generator), dim=1)
-    assert len(match_cells(coarse, coarse, 1.1)[0]) == 0
+    assert len(match_by_similarity(coarse, coarse, 1.1)[0]) == 0
 
 
 @pytest.mark.parametrize("block", [1, 3, 100])
@@ -128,14 +128,14 @@ def test_equal_cells_still_match_one_to_one(block):
     # Cells 0-3 of image 0 and all of image 1 look alike, as in flat areas; cell 4 of image 0 has no partner.
     alike = torch.tensor([1.0, 0.0])
     coarse0 = torch.stack([alike] * 4 + [torch.tensor([0.0, 1.0])])
-    index0, index1, _ = match_cells(coarse0, alike.repeat(6, 1), 0.8, block)
+    index0, index1, _ = match_by_similarity(coarse0, alike.repeat(6, 1), 0.8, block)
     assert len(index0) >= 1 and 4 not in index0
     assert len(index0.unique()) == len(index1.unique()) == len(index0)
 
 
 @pytest.mark.parametrize("counts", [(0, 5), (5, 0), (0, 0)])
 def test_no_cells_match_nothing(counts):
-    index0, index1, similarity = match_cells(torch.ones(counts[0], 4), torch.ones(counts[1], 4), 0.5)
+    index0, index1, similarity = match_by_similarity(torch.ones(counts[0], 4), torch.ones(counts[1], 4), 0.5)
     assert len(index0) == len(index1) == len(similarity) == 0
     assert index0.dtype == index1.dtype == torch.int64
 

@@ -133,7 +133,7 @@ def test_unreadable_files_are_refused(tmp_path):
 @pytest.mark.parametrize("text", ["", "images: photos\nout: out"])
 def test_a_missing_key_without_default_is_named(tmp_path, text):
     path = write(tmp_path / "train.yaml", text)
-    with pytest.raises(ConfigError, match="train.yaml lacks the key '(images|xfeat)'"):
+    with pytest.raises(ConfigError, match="train.yaml lacks the key '(images|start_from)'"):
         load_config(path, cls=TrainConfig)
 
 

@@ -17,7 +17,7 @@ from hm_sfm.config import ImageConfig
 from hm_sfm.coordinates import Grid
 from hm_sfm.images import prepare_array
 from hm_sfm.network.backbone import FineBranch, LightBackbone, XFeatTrunk
-from hm_sfm.network.coarse import match_cells
+from hm_sfm.network.coarse import CosineCoarse, match_by_similarity
 from hm_sfm.network.model import cell_to_px, count_cells, fine_cell_of
 from hm_sfm.training.supervision import patch_homography
 
@@ -82,7 +82,7 @@ def test_maps_have_the_size_of_their_grids():
         quarter, eighth = XFeatTrunk().eval()(torch.randn(1, 1, 64, 96))
     assert maps.coarse.shape == (2, 64, 8, 12) and maps.fine.shape == (2, 48, 32, 48)
     assert quarter.shape == (1, 24, 16, 24) and eighth.shape == (1, 64, 8, 12)
-    torch.testing.assert_close(maps.coarse.norm(dim=1), torch.ones(2, 8, 12))
+    torch.testing.assert_close(CosineCoarse().describe(maps.coarse).norm(dim=1), torch.ones(2, 8, 12))
 
 
 @pytest.mark.parametrize("grid", [COARSE, FINE], ids=["coarse", "fine"])
@@ -230,7 +230,7 @@ def test_the_coarse_grid_is_where_it_says(matcher, waves, image):
     scale = 0.7
     small = waves.render((int(scale * SIZE_WH[0]), int(scale * SIZE_WH[1])), np.diag([scale, scale, 1.0]))
     features0, features1 = (matcher.encode(prepare_array(photo, max(SIZE_WH))) for photo in (image, small))
-    index0, index1, _ = match_cells(features0.coarse, features1.coarse, 0.8)
+    index0, index1, _ = match_by_similarity(features0.coarse, features1.coarse, 0.8)
     assert len(index0) > 300
     error = COARSE.to_px(features1.cell[index1]) - scale * COARSE.to_px(features0.cell[index0])
     error = error[error.norm(dim=1) < 12]

@@ -323,7 +323,7 @@ def config(tmp_path) -> TrainConfig:
     return TrainConfig(
         images=str(write_photos(tmp_path / "photos")),
         out=str(tmp_path / "out"),
-        xfeat=str(write_xfeat(tmp_path / "xfeat.pt")),
+        start_from=str(write_xfeat(tmp_path / "xfeat.pt")),
         network=NetworkConfig(window=5, iterations=2, margin=0),
         steps=6,
         size_px=64,
@@ -381,7 +381,7 @@ def test_an_interrupted_training_goes_on_as_if_nothing_had_happened(config, tmp_
 def test_training_learns_the_fine_stage_and_leaves_the_trunk(config):
     path = train(dataclasses.replace(config, steps=2), quiet=True)
     trunk = XFeatTrunk()
-    load_xfeat(trunk, Path(config.xfeat))
+    load_xfeat(trunk, Path(config.start_from))
     net = load_weights(str(path))
     assert all(torch.equal(value, net.backbone.trunk.state_dict()[name]) for name, value in trunk.state_dict().items())
     torch.manual_seed(config.seed)
@@ -434,10 +434,10 @@ def test_unusable_xfeat_files_are_refused(config, tmp_path):
         if content:
             (tmp_path / name).write_bytes(content)
         with pytest.raises(WeightsError, match=name):
-            train(dataclasses.replace(config, xfeat=str(tmp_path / name)), quiet=True)
+            train(dataclasses.replace(config, start_from=str(tmp_path / name)), quiet=True)
     torch.save({"fc.weight": torch.zeros(3)}, tmp_path / "foreign.pt")
     with pytest.raises(WeightsError, match="foreign.pt is no XFeat weights file"):
-        train(dataclasses.replace(config, xfeat=str(tmp_path / "foreign.pt")), quiet=True)
+        train(dataclasses.replace(config, start_from=str(tmp_path / "foreign.pt")), quiet=True)
     assert not Path(config.out).exists()
 
 
@@ -449,7 +449,7 @@ def test_impossible_networks_are_refused(config, changed):
 
 def test_the_learning_rate_warms_up_and_falls():
     config = dataclasses.replace(
-        load_config(settings=("images=a", "out=b", "xfeat=c"), cls=TrainConfig), steps=100, warmup_steps=10
+        load_config(settings=("images=a", "out=b", "start_from=c"), cls=TrainConfig), steps=100, warmup_steps=10
     )
     rates = [learning_rate_at(step, config) for step in range(100)]
     assert rates[0] == pytest.approx(1e-4) and max(rates) == pytest.approx(1e-3) == pytest.approx(rates[10])

@@ -69,6 +69,11 @@ def render_view(
     return Rendering(np.clip(np.rint(mean), 0, 255).astype(np.uint8), depth)
 
 
+def find_surfaces(quads: tuple[Quad, ...], view: PinholeView) -> np.ndarray:
+    """(H, W) int32: which quad the centre of each pixel shows, -1 where there is none."""
+    return _find_nearest(quads, view, samples=1)[0]
+
+
 def _uvw_from_px(quad: Quad, view: PinholeView) -> np.ndarray | None:
     """(3, 3): px (x, y, 1) -> (u, v, 1) / z-depth of the quad's plane, all affine in x and y. None if edge-on."""
     rotation, translation = view.cam_from_world[:, :3], view.cam_from_world[:, 3]

@@ -10,9 +10,10 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from hm_sfm.atomic import replace_file
@@ -23,6 +24,7 @@ from hm_sfm.network.fine import make_fine_map
 from hm_sfm.network.model import HomoNet, load_loftr, pick_device, save_weights
 from hm_sfm.training.losses import measure_errors, measure_loss
 from hm_sfm.training.photos import WarpedPhotos, WarpRange, load_photos, split_photos
+from hm_sfm.training.scenes import MixedPairs, RenderedScenes, ViewRange
 from hm_sfm.training.supervision import PatchSupervision, draw_patches
 
 logger = logging.getLogger(__name__)
@@ -40,6 +42,9 @@ class TrainConfig:
     """Public weights of the frozen parts: XFeat's file for the backbone `light`, a LoFTR checkpoint for `loftr`."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     warp: WarpRange = field(default_factory=WarpRange)
+    views: ViewRange = field(default_factory=ViewRange)
+    rendered_share: float = 0.0
+    """Of the pairs that are rendered scenes with parallax; the others are warped photos."""
     steps: int = 8000
     pairs_per_step: int = 4
     patches_per_pair: int = 256
@@ -87,8 +92,8 @@ def train(config: TrainConfig, resume: bool = False, quiet: bool = False) -> Pat
         load_checkpoint(checkpoint, config, state)
     for name in ("log.csv", "validation.csv"):
         drop_rows_after(out / name, state.step)
-    pairs = WarpedPhotos(training, config.size_px, config.seed, config.steps * config.pairs_per_step, config.warp)
-    held_out = WarpedPhotos(validation, config.size_px, config.seed + 1, len(validation), config.warp)
+    pairs = make_pairs(training, config, config.seed, config.steps * config.pairs_per_step)
+    held_out = make_pairs(validation, config, config.seed + 1, len(validation))
     saved_at = time.monotonic()
     progress = tqdm(total=config.steps, initial=state.step, desc="training", unit="step", disable=quiet)
     with progress:
@@ -110,6 +115,13 @@ def train(config: TrainConfig, resume: bool = False, quiet: bool = False) -> Pat
     return out / "weights.pt"
 
 
+def make_pairs(photos: list[np.ndarray], config: TrainConfig, seed: int, count: int) -> MixedPairs:
+    """`count` pairs of both kinds, in the configured mixture."""
+    warped = WarpedPhotos(photos, config.size_px, seed, count, config.warp)
+    rendered = RenderedScenes(photos, config.size_px, seed, count, config.views)
+    return MixedPairs(warped, rendered, config.rendered_share, seed)
+
+
 def make_state(config: TrainConfig, device: torch.device) -> TrainState:
     """Network, its average and the optimizer at step 0; the parts that come from public weights are frozen."""
     torch.manual_seed(config.seed)
@@ -127,7 +139,7 @@ def make_state(config: TrainConfig, device: torch.device) -> TrainState:
     return TrainState(net, average, torch.optim.AdamW(trained, lr=config.learning_rate, weight_decay=1e-4))
 
 
-def iterate_batches(pairs: WarpedPhotos, batch_size: int, first_step: int) -> Iterator[dict[str, Tensor]]:
+def iterate_batches(pairs: Dataset, batch_size: int, first_step: int) -> Iterator[dict[str, Tensor]]:
     """Batches from step `first_step` on, prepared in a process of their own."""
     sampler = range(first_step * batch_size, len(pairs))
     yield from DataLoader(pairs, batch_size, sampler=sampler, num_workers=1, prefetch_factor=8)
@@ -162,11 +174,11 @@ def train_step(state: TrainState, batch: dict[str, Tensor], config: TrainConfig,
 def run_pairs(
     net: HomoNet, batch: dict[str, Tensor], config: TrainConfig, device: torch.device, generator: torch.Generator
 ) -> tuple[list, PatchSupervision]:
-    """Network output and truth of a batch: images (B, 2, S, S) uint8, b_from_a (B, 3, 3)."""
+    """Network output and truth of a batch of MixedPairs."""
     backbone = net.backbone
     truth = draw_patches(
         batch["b_from_a"],
-        config.size_px,
+        batch["surface"],
         config.patches_per_pair,
         backbone.coarse_grid,
         backbone.fine_grid,
@@ -213,7 +225,7 @@ def update_average(state: TrainState, decay: float) -> None:
 
 
 @torch.no_grad()
-def validate(net: HomoNet, pairs: WarpedPhotos, config: TrainConfig, device: torch.device) -> dict[str, float]:
+def validate(net: HomoNet, pairs: Dataset, config: TrainConfig, device: torch.device) -> dict[str, float]:
     """Errors of the dense points of correct matches on held-out pairs, in px of the network's input."""
     generator = torch.Generator().manual_seed(config.seed)
     errors = []

@@ -16,6 +16,8 @@ from hm_sfm.errors import InputError
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 LONG_EDGE_PX = 640
+SURFACES = 24
+"""Homographies per item: a rendered scene has one per surface, a warped photo the same one throughout."""
 
 logger = logging.getLogger(__name__)
 
@@ -61,7 +63,8 @@ def split_photos(photos: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.nd
 
 
 class WarpedPhotos(Dataset):
-    """Items: images (2, S, S) uint8, b_from_a (3, 3) float32 (px of view A -> px of view B)."""
+    """Items: images (2, S, S) uint8, b_from_a (SURFACES, 3, 3) float32 (px of view A -> px of view B, by surface) and
+    surface (S, S) int64 (the surface at each pixel of A, -1 where B does not show it)."""
 
     def __init__(self, photos: list[np.ndarray], size_px: int, seed: int, count: int, warp: WarpRange) -> None:
         self.photos, self.size_px, self.seed, self.count, self.warp = photos, size_px, seed, count, warp
@@ -76,7 +79,11 @@ class WarpedPhotos(Dataset):
         views = [render_view(photo, matrix, self.size_px) for matrix in (a_from_photo, b_from_photo)]
         images = np.stack([disturb_view(view, rng) for view in views])
         b_from_a = b_from_photo @ np.linalg.inv(a_from_photo)
-        return {"images": images, "b_from_a": (b_from_a / b_from_a[2, 2]).astype(np.float32)}
+        return {
+            "images": images,
+            "b_from_a": np.tile((b_from_a / b_from_a[2, 2]).astype(np.float32), (SURFACES, 1, 1)),
+            "surface": np.zeros((self.size_px, self.size_px), np.int64),
+        }
 
 
 def draw_views(

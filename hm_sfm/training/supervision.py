@@ -34,23 +34,28 @@ class PatchSupervision:
 
 def draw_patches(
     b_from_a: Tensor,
-    size_px: int,
+    surface: Tensor,
     per_pair: int,
     coarse_grid: Grid,
     fine_grid: Grid,
     half: float,
     generator: torch.Generator,
 ) -> PatchSupervision:
-    """Draw coarse matches of warped views: mostly the true cell, some one cell off, some wrong.
+    """Draw coarse matches of two views: mostly the true cell, some one cell off, some wrong.
 
-    b_from_a: (B, 3, 3) float32, px of view A -> px of view B, both size_px x size_px. Cells whose partner is outside
-    view B are left out, so P <= B * per_pair.
+    b_from_a: (B, SURFACES, 3, 3) float32, px of view A -> px of view B over each surface; surface: (B, S, S) int64, the
+    surface at each pixel of A, -1 where B does not show it. Cells whose centre B does not show are left out, so
+    P <= B * per_pair.
     """
-    batch = len(b_from_a)
+    batch, size_px = surface.shape[:2]
     cells = size_px // coarse_grid.stride
     coarse0 = torch.randint(cells, (batch, per_pair, 2), generator=generator)
     centre0_px = coarse_grid.to_px(coarse0.float())
-    centre1_px = apply_homography(b_from_a, centre0_px)
+    item_index = torch.arange(batch)[:, None]
+    x, y = centre0_px.long().unbind(dim=-1)
+    shown = surface[item_index, y, x]
+    homography_px = b_from_a[item_index, shown.clamp_min(0)]
+    centre1_px = apply_homography(homography_px.flatten(0, 1), centre0_px.reshape(-1, 1, 2)).view(batch, -1, 2)
     coarse1 = torch.floor(coarse_grid.from_px(centre1_px) + 0.5).long()
     jitter = torch.randint(-1, 2, (batch, per_pair, 2), generator=generator)
     kind = torch.rand(batch, per_pair, 1, generator=generator)
@@ -59,11 +64,15 @@ def draw_patches(
     jittered = ~wrong & (kind < WRONG_SHARE + JITTERED_SHARE)
     coarse1 = torch.where(wrong, anywhere, coarse1 + jittered * jitter)
 
-    inside = ((centre1_px > 4) & (centre1_px < size_px - 4)).all(-1) & ((coarse1 >= 0) & (coarse1 < cells)).all(-1)
+    inside = (
+        (shown >= 0)
+        & ((centre1_px > 4) & (centre1_px < size_px - 4)).all(-1)
+        & ((coarse1 >= 0) & (coarse1 < cells)).all(-1)
+    )
     image_index, item = inside.nonzero(as_tuple=True)
     cell0 = fine_cell_of(coarse0[image_index, item], coarse_grid, fine_grid)
     cell1 = fine_cell_of(coarse1[image_index, item], coarse_grid, fine_grid)
-    homography = patch_homography(b_from_a[image_index], cell0, cell1, fine_grid)
+    homography = patch_homography(homography_px[image_index, item], cell0, cell1, fine_grid)
     corners = make_corners(half)
     displacement = apply_homography(homography, corners) - corners
     within_reach = (displacement.abs().amax(dim=(1, 2)) < 2 * half) & is_regular(homography, half)

@@ -116,10 +116,10 @@ def test_the_homography_between_views_is_that_of_the_item():
         points = make_pixel_centres(size, size)[8:-8:16, 8:-8:16]
         in_photo = map_points(np.linalg.inv(a_from_photo), points)
         np.testing.assert_allclose(
-            map_points(item["b_from_a"].astype(float), points), map_points(b_from_photo, in_photo), atol=0.05
+            map_points(item["b_from_a"][0].astype(float), points), map_points(b_from_photo, in_photo), atol=0.05
         )
         assert item["images"].shape == (2, size, size) and item["images"].dtype == np.uint8
-        assert item["b_from_a"].dtype == np.float32 and item["b_from_a"][2, 2] == 1
+        assert item["b_from_a"].dtype == np.float32 and item["b_from_a"][0, 2, 2] == 1
 
 
 def test_items_depend_on_seed_and_index_alone():
@@ -197,8 +197,9 @@ def test_validation_photos_are_not_trained_on():
 
 
 def draw(b_from_a: np.ndarray, seed: int = 0, per_pair: int = 400) -> PatchSupervision:
-    matrix = torch.tensor(b_from_a, dtype=torch.float32).reshape(-1, 3, 3)
-    return draw_patches(matrix, 256, per_pair, COARSE, FINE, HALF, torch.Generator().manual_seed(seed))
+    matrix = torch.tensor(b_from_a, dtype=torch.float32).reshape(-1, 1, 3, 3)
+    surface = torch.zeros(len(matrix), 256, 256, dtype=torch.int64)
+    return draw_patches(matrix, surface, per_pair, COARSE, FINE, HALF, torch.Generator().manual_seed(seed))
 
 
 def test_patches_hold_the_truth():

@@ -16,6 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from hm_sfm.adjustment import adjust_keypoints, measure_residuals
+from hm_sfm.budget import choose_budget
 from hm_sfm.config import KeypointConfig
 from hm_sfm.images import PreparedImage
 from hm_sfm.neighbours import find_nearest, find_pairs_within
@@ -23,8 +24,6 @@ from hm_sfm.tracks import label_tracks, measure_lengths
 from hm_sfm.types import ImagePair, IndexMatches, Keypoints, PairMatches, apply_homographies
 
 SEED_CELL_PX = 8
-BUDGET_CELL_PX = 32
-"""The budget of keypoints is spread over square cells of this size."""
 AGREEMENT_PX = 0.5
 """Distance from the mean at which a patch's say on a carried point counts half."""
 AGREEMENT_ROUNDS = 3
@@ -303,37 +302,6 @@ def finish_keypoints(
     used = agreed & (label[source] == label[target]) & kept[source] & kept[target]
     matches = group_matches(photos, image, new_index - kept_start[image], source[used], target[used], score[used])
     return tuple(keypoints), matches
-
-
-def choose_budget(
-    label: np.ndarray, length: np.ndarray, sigma: np.ndarray, xy: np.ndarray, image: np.ndarray, budget: int
-) -> np.ndarray:
-    """(K,) bool: keypoints whose track at least half of its images choose among their best `budget`.
-
-    Each image takes its longest, then most certain tracks, cell by cell in turns, so that they spread.
-    label, length, sigma, image: (K,); xy: (K, 2) units.
-    """
-    if len(label) == 0:
-        return np.zeros(0, bool)
-    cell = np.floor(xy / BUDGET_CELL_PX).astype(np.int64).clip(-1, 100_000)
-    place = (image * 200_000 + cell[:, 1]) * 200_000 + cell[:, 0]
-    order = np.lexsort((sigma, -length, place))
-    turn = np.empty(len(label), np.int64)
-    turn[order] = rank_in_groups(place[order])
-    # A cell's second-longest track comes before another's single-pair one: turns count less than length.
-    order = np.lexsort((sigma, turn // 4 - length, image))
-    chosen = np.empty(len(label), bool)
-    chosen[order] = rank_in_groups(image[order]) < budget
-    _, track = np.unique(label, return_inverse=True)
-    votes = np.bincount(track, chosen) / np.bincount(track)
-    return votes[track] >= 0.5
-
-
-def rank_in_groups(group: np.ndarray) -> np.ndarray:
-    """(N,) int64: position of each entry within its run of equal values; group: (N,), sorted."""
-    first = np.concatenate([[True], group[1:] != group[:-1]])
-    starts = np.flatnonzero(first)
-    return np.arange(len(group)) - np.repeat(starts, np.diff(np.append(starts, len(group))))
 
 
 def group_matches(

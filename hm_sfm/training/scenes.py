@@ -76,8 +76,8 @@ def make_board(
 ) -> Quad:
     """A rectangle with a photo on it: turned by tilt_deg about the vertical, then about the horizontal axis."""
     photo = photos[rng.integers(len(photos))]
-    # Large boards carry the photo many times over, mirrored, so that it keeps about its own resolution.
-    copies = max(1, round(side / 3))
+    # Large boards carry the photo several times, mirrored, so that it keeps about its own resolution.
+    copies = min(max(1, round(side / 3)), 4)
     tile = np.concatenate([photo if i % 2 == 0 else photo[:, ::-1] for i in range(copies)], axis=1)
     texture = np.concatenate([tile if i % 2 == 0 else tile[::-1] for i in range(copies)], axis=0)
     height = side * texture.shape[0] / texture.shape[1]

@@ -5,16 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
+from hm_sfm.budget import choose_budget, rank_in_groups
 from hm_sfm.config import KeypointConfig
 from hm_sfm.images import prepare_array
 from hm_sfm.keypoints import (
     Photo,
-    choose_budget,
     differentiate,
     find_seeds,
     group_matches,
     persist_keypoints,
-    rank_in_groups,
     thin_points,
 )
 from hm_sfm.types import ImagePair, PairMatches, apply_homographies

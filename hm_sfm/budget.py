@@ -1,0 +1,37 @@
+"""Which tracks are kept: a budget of keypoints per image, spent on long tracks that spread over the image."""
+
+import numpy as np
+
+BUDGET_CELL_PX = 32
+"""Side of the square cells over which an image's keypoints are spread, px of the matching resolution."""
+
+
+def choose_budget(
+    label: np.ndarray, length: np.ndarray, sigma: np.ndarray, xy: np.ndarray, image: np.ndarray, budget: int
+) -> np.ndarray:
+    """(K,) bool: keypoints whose track at least half of its images choose among their best `budget`.
+
+    Each image takes its longest, then most certain tracks, cell by cell in turns, so that they spread.
+    label, length, sigma, image: (K,); xy: (K, 2) units.
+    """
+    if len(label) == 0:
+        return np.zeros(0, bool)
+    cell = np.floor(xy / BUDGET_CELL_PX).astype(np.int64).clip(-1, 100_000)
+    place = (image * 200_000 + cell[:, 1]) * 200_000 + cell[:, 0]
+    order = np.lexsort((sigma, -length, place))
+    turn = np.empty(len(label), np.int64)
+    turn[order] = rank_in_groups(place[order])
+    # A cell's second-longest track comes before another's single-pair one: turns count less than length.
+    order = np.lexsort((sigma, turn // 4 - length, image))
+    chosen = np.empty(len(label), bool)
+    chosen[order] = rank_in_groups(image[order]) < budget
+    _, track = np.unique(label, return_inverse=True)
+    votes = np.bincount(track, chosen) / np.bincount(track)
+    return votes[track] >= 0.5
+
+
+def rank_in_groups(group: np.ndarray) -> np.ndarray:
+    """(N,) int64: position of each entry within its run of equal values; group: (N,), sorted."""
+    first = np.concatenate([[True], group[1:] != group[:-1]])
+    starts = np.flatnonzero(first)
+    return np.arange(len(group)) - np.repeat(starts, np.diff(np.append(starts, len(group))))

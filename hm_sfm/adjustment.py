@@ -6,12 +6,23 @@ one homography. Together they pin it down better than any of them.
 
 import numpy as np
 
-PRIOR_WEIGHT = 0.05
+PRIOR_WEIGHT = 0.01
 """Of each keypoint's first position, relative to one prediction: holds a track where its predictions leave it free."""
 ROUNDS = 15
 STEP = 0.6
+FULL_TRUST_PX = 0.25
+"""Expected error of a prediction at which its weight is a half; 1 is the weight of an exact one."""
 ROBUST_SCALE = 0.5
 """Residual, in the unit of the coordinates, beyond which a prediction loses weight (Cauchy)."""
+
+
+def weigh_scores(score: np.ndarray) -> np.ndarray:
+    """Scores (N,) in [0, 1], probabilities of an error below 1 px, -> weights (N,) in (0, 1) for least squares.
+
+    The inverse of the squared error scale b of the Laplace distribution with that probability, 1 - exp(-1 / b).
+    """
+    scale = -1 / np.log1p(-np.clip(score, 1e-3, 1 - 1e-6).astype(np.float64))
+    return FULL_TRUST_PX**2 / (FULL_TRUST_PX**2 + scale**2)
 
 
 def adjust_keypoints(

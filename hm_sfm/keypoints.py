@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from hm_sfm.adjustment import adjust_keypoints, measure_residuals
+from hm_sfm.adjustment import adjust_keypoints, measure_residuals, weigh_scores
 from hm_sfm.budget import choose_budget
 from hm_sfm.config import KeypointConfig
 from hm_sfm.images import PreparedImage
@@ -102,7 +102,10 @@ class GrowingKeypoints:
 
 
 def find_seeds(image: PreparedImage) -> np.ndarray:
-    """The best-localised pixel (Shi-Tomasi) of each 8 x 8 px cell: (N, 2) float64 px of the stored image, best first."""
+    """The best-localised pixel (Shi-Tomasi) of each 8 x 8 px cell.
+
+    Returns (N, 2) float64 px of the stored image, best first.
+    """
     height, width = image.grey.shape
     rows, columns = height // SEED_CELL_PX, width // SEED_CELL_PX
     response = cv2.cornerMinEigenVal(image.grey, blockSize=3, ksize=3)
@@ -176,8 +179,7 @@ def predict_points(
     point, slot = np.unique(at, return_inverse=True)
     homography = carrier.homography[patch]
     says = apply_homographies(homography, xy[at]).astype(np.float64)
-    # The floor keeps means defined where a foreign matcher gives scores of zero.
-    prior = np.maximum(carrier.score[patch], 1e-3) * (1.05 - distance / radius)
+    prior = weigh_scores(carrier.score[patch]) * (1.05 - distance / radius)
     trust = prior
     for _ in range(AGREEMENT_ROUNDS):
         predicted = mean_in_groups(says, slot, trust, len(point))
@@ -279,7 +281,9 @@ def finish_keypoints(
 
     label = label_tracks(len(xy), source, target, score, image)
     same = label[source] == label[target]
-    moved, sigma = adjust_keypoints(xy, source[same], target[same], predicted[same], jacobian[same], score[same])
+    moved, sigma = adjust_keypoints(
+        xy, source[same], target[same], predicted[same], jacobian[same], weigh_scores(score[same])
+    )
     residual = measure_residuals(xy, moved, source, target, predicted, jacobian)
     agreed = same & (residual <= config.join_radius_px)
     label = label_tracks(len(xy), source[agreed], target[agreed], score[agreed], image)

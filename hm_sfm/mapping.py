@@ -156,15 +156,18 @@ def verify_pairs(
     verified = {}
     for pair in tqdm(pairs, desc="verify", unit="pair", disable=quiet):
         matches = read(pair)
-        inliers = verify_pair(
-            matches,
+        confident = np.flatnonzero(matches.score >= config.min_score)
+        agreeing = verify_pair(
+            matches.select(confident),
             cameras[pair.name0],
             cameras[pair.name1],
             config.max_error_px * max(px_per_unit[pair.name0], px_per_unit[pair.name1]),
             config.min_inliers,
             config.min_inlier_ratio,
         )
-        if inliers.any():
+        if agreeing.any():
+            inliers = np.zeros(len(matches), dtype=bool)
+            inliers[confident[agreeing]] = True
             cover0 = measure_cover(matches.xy0[inliers], size_wh[pair.name0])
             cover1 = measure_cover(matches.xy1[inliers], size_wh[pair.name1])
             verified[pair] = VerifiedPair(pair, inliers, np.count_nonzero(inliers) * min(cover0, cover1))

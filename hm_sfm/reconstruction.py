@@ -25,7 +25,7 @@ from hm_sfm.matching import match_pairs
 from hm_sfm.network.model import HomoMatcher, digest_weights
 from hm_sfm.pairs import select_pairs, write_pairs
 from hm_sfm.store import MatchStore, digest_image
-from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, MappingResult, PairMatches
+from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, MappingResult
 
 MARKER = ".hm_sfm"
 """File by which a folder is known as the output of a run."""
@@ -177,21 +177,9 @@ def carry_keypoints(
     return persist_keypoints(
         photos,
         [found.pair for found in ranked],
-        lambda pair: take_inliers(store.read(pair), verified[pair]),
+        lambda pair: store.read(pair).select(verified[pair].inliers),
         config.keypoints,
         quiet,
-    )
-
-
-def take_inliers(matches: PairMatches, verified: VerifiedPair) -> PairMatches:
-    """The matches of a pair that agree with its two-view geometry."""
-    keep = verified.inliers
-    return dataclasses.replace(
-        matches,
-        xy0=matches.xy0[keep],
-        xy1=matches.xy1[keep],
-        score=matches.score[keep],
-        homography=matches.homography[keep],
     )
 
 

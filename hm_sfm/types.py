@@ -6,9 +6,9 @@ column c and row r spans [c, c+1) x [r, r+1), so the centre of the top-left pixe
 Arrays are copied and made read-only on creation; shape and dtype are checked. M = 0 is valid everywhere.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -71,7 +71,7 @@ class PatchMatches:
     xy1: np.ndarray
     """(M, 2) float32 px: where the homographies put these centres in image 1."""
     score: np.ndarray
-    """(M,) float32 in [0, 1]."""
+    """(M,) float32 in [0, 1]: the probability that a match is off by less than 1 px of the matching resolution."""
     homography: np.ndarray
     """(M, 3, 3) float32: image 0 px -> image 1 px around match i, scaled so that its denominator is 1 at xy0[i]."""
     patch_radius_px: float
@@ -86,6 +86,16 @@ class PatchMatches:
 
     def __len__(self) -> int:
         return len(self.score)
+
+    def select(self, chosen: np.ndarray) -> Self:
+        """The matches that `chosen`, (M,) bool or indices, names; in its order."""
+        return replace(
+            self,
+            xy0=self.xy0[chosen],
+            xy1=self.xy1[chosen],
+            score=self.score[chosen],
+            homography=self.homography[chosen],
+        )
 
     def warp(self, xy0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Carry points of image 0 into image 1, each by the patch whose centre is nearest.

@@ -28,7 +28,7 @@ FINE_CHUNK = 512
 
 
 class HomoNet(nn.Module):
-    """Backbone, coarse stage and fine head. The parts are called one by one: features once per image, the rest per pair.
+    """Backbone, coarse stage and fine head, called one by one: features once per image, the rest per pair.
 
     Raises ConfigError where the configuration names no known backbone or head, or an impossible size.
     """

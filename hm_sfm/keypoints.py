@@ -27,6 +27,8 @@ SEED_CELL_PX = 8
 AGREEMENT_PX = 0.5
 """Distance from the mean at which a patch's say on a carried point counts half."""
 AGREEMENT_ROUNDS = 3
+LEAST_AGREEMENT = 0.6
+"""Share of the patches, by weight, that must agree: at the edges of things, where depth jumps, they don't."""
 
 
 @dataclass(frozen=True)
@@ -172,8 +174,8 @@ def predict_points(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Where the patches within `radius` put points: the robust mean of what they say, near patches counting more.
 
-    xy: (N, 2) units. Returns point (C,) int64, the points that any patch covers, predicted (C, 2), jacobian
-    (C, 2, 2) and score (C,): the patches' mean score times the share of them that agrees.
+    xy: (N, 2) units. Returns point (C,) int64, the points that any patch covers and whose patches agree, predicted
+    (C, 2), jacobian (C, 2, 2) and score (C,): the patches' mean score times the share of them that agrees.
     """
     at, patch, distance = find_pairs_within(xy, carrier.centre, radius)
     point, slot = np.unique(at, return_inverse=True)
@@ -188,7 +190,8 @@ def predict_points(
     jacobian = mean_in_groups(differentiate(homography, xy[at]).reshape(-1, 4), slot, trust, len(point))
     share = np.bincount(slot, trust, len(point)) / np.bincount(slot, prior, len(point))
     score = mean_in_groups(carrier.score[patch][:, None], slot, prior, len(point))[:, 0] * share
-    return point, predicted, jacobian.reshape(-1, 2, 2), score
+    agreed = share >= LEAST_AGREEMENT
+    return point[agreed], predicted[agreed], jacobian.reshape(-1, 2, 2)[agreed], score[agreed]
 
 
 def mean_in_groups(values: np.ndarray, group: np.ndarray, weight: np.ndarray, count: int) -> np.ndarray:

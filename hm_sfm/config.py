@@ -68,8 +68,8 @@ class MatchingConfig:
 class VerificationConfig:
     """Two-view geometry, before anything is carried and again on the final keypoints."""
 
-    min_score: float = 0.3
-    """Matches below are not used: most of them are wrong."""
+    min_score: float = 0.5
+    """Matches below are not used: they are off by more than a pixel, or wrong altogether."""
     max_error_px: float = 3.0
     """At the matching resolution; scaled to the photo."""
     min_inliers: int = 30

@@ -27,7 +27,7 @@ SEED_CELL_PX = 8
 AGREEMENT_PX = 0.5
 """Distance from the mean at which a patch's say on a carried point counts half."""
 AGREEMENT_ROUNDS = 3
-LEAST_AGREEMENT = 0.6
+LEAST_AGREEMENT = 0.8
 """Share of the patches, by weight, that must agree: at the edges of things, where depth jumps, they don't."""
 
 

@@ -146,7 +146,7 @@ def test_a_killed_matching_goes_on_with_the_pairs_that_are_missing(
     assert 3 <= stored < 10
     assert not (out / "matches.h5").exists()
     # What a kill in the middle of writing leaves.
-    (out / "matches.h5.parts" / f"{stored:06d}.tmp").write_bytes(b"half a file")
+    (out / "matches.h5.parts" / f"{stored:06d}.h5.tmp").write_bytes(b"half a file")
 
     assert run("match", scene.images, out).code == 0
     assert len(matched_pairs) == 10 - stored

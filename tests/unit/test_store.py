@@ -103,8 +103,8 @@ def test_merging_twice_changes_nothing(tmp_path, batch):
 def test_a_batch_that_was_cut_off_is_ignored(tmp_path, batch):
     store = open_store(tmp_path)
     store.write(batch[:1])
-    (store.parts / "000001.tmp").write_bytes(b"half a file")
-    (tmp_path / "matches.tmp").write_bytes(b"half a file")
+    (store.parts / "000001.h5.tmp").write_bytes(b"half a file")
+    (tmp_path / "matches.h5.tmp").write_bytes(b"half a file")
     store = open_store(tmp_path)
     assert batch[0].pair in store and batch[1].pair not in store
     store.write(batch[1:])
@@ -132,7 +132,7 @@ def test_a_crash_while_merging_loses_nothing(tmp_path, batch, monkeypatch):
     def crash(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("hm_sfm.store.os.replace", crash)
+    monkeypatch.setattr("hm_sfm.atomic.os.replace", crash)
     with pytest.raises(KeyboardInterrupt):
         store.merge()
     monkeypatch.undo()

@@ -28,11 +28,6 @@ class Grid:
         return (xy_px - self.offset) / self.stride
 
 
-def pixel_index_from_px(xy_px: Array) -> Array:
-    """COLMAP px (..., 2) -> OpenCV's indices, where pixel centres are integers."""
-    return xy_px - 0.5
-
-
 def px_from_pixel_index(index: Array) -> Array:
     """OpenCV's indices (..., 2), where pixel centres are integers -> COLMAP px."""
     return index + 0.5
@@ -50,16 +45,6 @@ def homography_from_pixel_index(homography: np.ndarray) -> np.ndarray:
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
     back = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
     return half @ homography @ back
-
-
-def rotate_px(xy_px: np.ndarray, size_wh: tuple[int, int], rotation_deg: int) -> np.ndarray:
-    """Carry points along when an image is turned clockwise.
-
-    xy_px: (..., 2) px in the image before turning, whose size is `size_wh`. Returns px after turning by
-    `rotation_deg` (0, 90, 180 or 270) clockwise.
-    """
-    matrix = rotation_matrix(size_wh, rotation_deg)
-    return (xy_px @ matrix[:2, :2].T + matrix[:2, 2]).astype(xy_px.dtype)
 
 
 def rotation_matrix(size_wh: tuple[int, int], rotation_deg: int) -> np.ndarray:

@@ -221,9 +221,3 @@ def open_database(path: Path) -> pycolmap.Database:
     if not Path(path).is_file():  # pycolmap would create it
         raise InputError(f"there is no database {path}")
     return pycolmap.Database.open(path)
-
-
-def read_image_ids(path: Path) -> dict[str, int]:
-    """Image name -> image id of a COLMAP database. Raises InputError where there is no such file."""
-    with open_database(path) as database:
-        return {image.name: image.image_id for image in database.read_all_images()}

@@ -18,6 +18,7 @@ from tqdm import tqdm
 from hm_sfm.adjustment import adjust_keypoints, measure_residuals, weigh_scores
 from hm_sfm.budget import choose_budget
 from hm_sfm.config import KeypointConfig
+from hm_sfm.coordinates import px_from_pixel_index
 from hm_sfm.images import PreparedImage
 from hm_sfm.neighbours import find_nearest, find_pairs_within
 from hm_sfm.tracks import label_tracks, measure_lengths
@@ -116,7 +117,7 @@ def find_seeds(image: PreparedImage) -> np.ndarray:
     best = cells.argmax(axis=2)
     y = np.arange(rows)[:, None] * SEED_CELL_PX + best // SEED_CELL_PX
     x = np.arange(columns)[None, :] * SEED_CELL_PX + best % SEED_CELL_PX
-    xy = np.stack([x, y], axis=-1).reshape(-1, 2) + 0.5
+    xy = px_from_pixel_index(np.stack([x, y], axis=-1).reshape(-1, 2))
     order = np.argsort(-cells.max(axis=2).ravel(), kind="stable")
     stored = image.stored_from_scaled
     return xy[order] @ stored[:2, :2].T + stored[:2, 2]

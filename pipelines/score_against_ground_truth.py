@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from hm_sfm.config import CameraConfig, Config
-from hm_sfm.evaluation import read_strecha_cameras, score_model
+from hm_sfm.evaluation import measure_position_error, read_strecha_cameras, score_model
 from hm_sfm.reconstruction import reconstruct
 
 AUC_SHOWN_DEG = (0.25, 0.5, 1, 3, 5)
@@ -35,6 +35,9 @@ def score_against_ground_truth(scene: Path, out: Path) -> None:
     print(f"    of pose errors  {' / '.join(f'{value:5.1f}' for value in auc)} %")
     print(f"median rotation     {score.median_rotation_deg:.3f} deg")
     print(f"median translation  {score.median_translation_deg:.3f} deg")
+    print(
+        f"camera positions    {100 * measure_position_error(result.models[0], truth):.3f} % of the scene's extent off"
+    )
     print(f"points              {result.points}")
     print(f"mean track length   {result.mean_track_length:.2f} images")
     print(f"mean reprojection   {result.mean_reprojection_px:.3f} px")

@@ -7,10 +7,15 @@ import pycolmap
 import pytest
 
 from hm_sfm.config import CameraConfig
-from hm_sfm.database import Cameras, make_cameras, read_image_ids, write_database
+from hm_sfm.database import Cameras, make_cameras, open_database, write_database
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.exif import write_jpeg
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
+
+
+def list_image_ids(path):
+    with open_database(path) as database:
+        return {image.name: image.image_id for image in database.read_all_images()}
 
 
 def make_photo(
@@ -189,7 +194,7 @@ def write_small_database(path: Path) -> tuple[list[Keypoints], list[IndexMatches
 def test_database_holds_what_was_written(tmp_path):
     path = tmp_path / "database.db"
     keypoints, matches = write_small_database(path)
-    assert read_image_ids(path) == {"b 1.jpg": 1, "sub/ü.jpg": 2, "a.jpg": 3}
+    assert list_image_ids(path) == {"b 1.jpg": 1, "sub/ü.jpg": 2, "a.jpg": 3}
     with pycolmap.Database.open(path) as database:
         for image_id, points in enumerate(keypoints, start=1):
             stored = database.read_keypoints(image_id)
@@ -225,7 +230,7 @@ def test_an_earlier_database_and_its_leftovers_are_replaced(tmp_path):
         (tmp_path / f"database.db{ending}").write_bytes(b"stale")
     write_small_database(path)
     assert [entry.name for entry in tmp_path.iterdir()] == ["database.db"]
-    assert len(read_image_ids(path)) == 3
+    assert len(list_image_ids(path)) == 3
 
 
 def test_a_failed_write_leaves_the_earlier_database(tmp_path):
@@ -266,5 +271,5 @@ def test_keypoints_in_another_order_than_the_images_are_refused(tmp_path):
 
 def test_reading_ids_of_a_missing_database_does_not_create_it(tmp_path):
     with pytest.raises(InputError, match="missing.db"):
-        read_image_ids(tmp_path / "missing.db")
+        open_database(tmp_path / "missing.db")
     assert not list(tmp_path.iterdir())

@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from hm_sfm.config import MappingConfig, VerificationConfig
-from hm_sfm.database import Cameras, read_image_ids, write_database
+from hm_sfm.database import Cameras, open_database, write_database
 from hm_sfm.errors import InputError
 from hm_sfm.mapping import map_incrementally, summarise_models, verify_database, verify_pair, verify_pairs
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, PairMatches
@@ -195,7 +195,8 @@ def test_missing_database_is_an_input_error(tmp_path):
 def test_verification_replaces_earlier_geometries_and_drops_planted_outliers(tmp_path, oracle):
     path = write_and_verify(tmp_path, oracle, make_known_camera(oracle))
     first = oracle.matches[0]
-    image_ids = read_image_ids(path)
+    with open_database(path) as database:
+        image_ids = {image.name: image.image_id for image in database.read_all_images()}
     id0, id1 = image_ids[first.pair.name0], image_ids[first.pair.name1]
     wrong = first.indices.copy()
     wrong[:20, 1] = np.roll(wrong[:20, 1], 7)

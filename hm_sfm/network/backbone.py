@@ -21,8 +21,8 @@ class FeatureMaps:
 
     coarse: Tensor
     """(B, Cc, H/8, W/8)."""
-    fine: Tensor
-    """(B, Cf, H/2, W/2)."""
+    fine: Tensor | None
+    """(B, Cf, H/2, W/2); None where it was not asked for."""
 
 
 class ConvBlock(nn.Sequential):
@@ -102,11 +102,11 @@ class LightBackbone(nn.Module):
         self.trunk = XFeatTrunk()
         self.fine = FineBranch(self.fine_channels)
 
-    def forward(self, image: Tensor) -> FeatureMaps:
+    def forward(self, image: Tensor, want_fine: bool = True) -> FeatureMaps:
         """image: (B, 1, H, W) float32 of zero mean and unit variance, H and W multiples of `stride`."""
         image = image.contiguous(memory_format=torch.channels_last)
         quarter, eighth = self.trunk(image)
-        return FeatureMaps(coarse=eighth, fine=self.fine(image, quarter, eighth))
+        return FeatureMaps(coarse=eighth, fine=self.fine(image, quarter, eighth) if want_fine else None)
 
 
 def load_xfeat(trunk: XFeatTrunk, path: Path) -> None:
@@ -123,6 +123,9 @@ def load_xfeat(trunk: XFeatTrunk, path: Path) -> None:
     missing = [key for key in wanted if key not in renamed and not key.endswith("num_batches_tracked")]
     if missing:
         raise WeightsError(f"{path} is no XFeat weights file: {missing[0]} and {len(missing) - 1} more are missing")
+    misshapen = [key for key, value in wanted.items() if getattr(renamed.get(key, value), "shape", None) != value.shape]
+    if misshapen:
+        raise WeightsError(f"{path} is no XFeat weights file: {misshapen[0]} is of another shape")
     trunk.load_state_dict({key: renamed.get(key, value) for key, value in wanted.items()})
 
 

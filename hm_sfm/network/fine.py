@@ -135,11 +135,18 @@ class HomographyHead(nn.Module):
         return (self.window - 1) / 2
 
     def forward(
-        self, fine0: FineMap, fine1: FineMap, image_index: Tensor, cell0: Tensor, cell1: Tensor
+        self,
+        fine0: FineMap,
+        fine1: FineMap,
+        image_index: Tensor,
+        cell0: Tensor,
+        cell1: Tensor,
+        start: Tensor | None = None,
     ) -> list[FineEstimate]:
         """Homographies from the patch around cell0 of fine0 to the patch around cell1 of fine1.
 
-        image_index: (P,) int64, into both batches; cell0, cell1: (P, 2) int64, cells of the 1/2 grid. Returns the
+        image_index: (P,) int64, into both batches; cell0, cell1: (P, 2) int64, cells of the 1/2 grid; start: (P, 4, 2)
+        float32 cells, displacements of the corners to start from, None for the paper's identity. Returns the
         FineEstimate of each iteration.
         """
         patch0 = gather_patches(fine0, image_index, cell0, self.window)
@@ -147,7 +154,7 @@ class HomographyHead(nn.Module):
         # A last row of zero features makes the zero that sample_windows takes outside the maps.
         full = correlate_patches(patch0, F.pad(patch1, (0, 0, 0, 1)))
         pooled = full @ self.pooling.to(full.dtype)
-        displacement = full.new_zeros((len(cell0), 4, 2), dtype=torch.float32)
+        displacement = full.new_zeros((len(cell0), 4, 2), dtype=torch.float32) if start is None else start
         estimates = []
         for _ in range(self.iterations):
             displacement = displacement.detach()

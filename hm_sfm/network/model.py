@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +17,9 @@ from hm_sfm.coordinates import Grid
 from hm_sfm.errors import ConfigError, WeightsError
 from hm_sfm.images import PreparedImage, prepare_array, prepare_image, read_ref
 from hm_sfm.network.backbone import LightBackbone
-from hm_sfm.network.coarse import CosineCoarse, LoftrCoarse
+from hm_sfm.network.coarse import AttentionCoarse, CosineCoarse, LoftrCoarse
 from hm_sfm.network.fine import ExpectationHead, FineMap, HomographyHead, make_fine_map
+from hm_sfm.network.growth import GridMatches, PatchGrid, grow_matches
 from hm_sfm.network.homography import is_regular
 from hm_sfm.network.resnet import LoftrBackbone
 from hm_sfm.types import PatchMatches
@@ -25,6 +27,10 @@ from hm_sfm.types import PatchMatches
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 FINE_CHUNK = 512
 """Patches per call of the fine head: bounds its memory to about 50 MB."""
+GROWING_SCORE = 0.5
+"""Matches at least as good as this spread to their neighbours."""
+GROWING_ROUNDS = 8
+"""How many cells far they spread."""
 
 
 class HomoNet(nn.Module):
@@ -41,23 +47,22 @@ class HomoNet(nn.Module):
         for field, least in (("radius", 0), ("iterations", 1), ("margin", 0)):
             if getattr(config, field) < least:
                 raise ConfigError(f"network.{field} must be at least {least}, found {getattr(config, field)}")
-        if config.backbone == "light":
-            self.backbone, self.coarse = LightBackbone(), CosineCoarse()
-        elif config.backbone == "loftr":
-            self.backbone, self.coarse = LoftrBackbone(), LoftrCoarse()
-        else:
+        if config.backbone not in ("light", "loftr"):
             raise ConfigError(f"network.backbone must be light or loftr, found {config.backbone!r}")
+        light = config.backbone == "light"
+        self.backbone = LightBackbone() if light else LoftrBackbone()
+        if config.coarse == "attention":
+            self.coarse = AttentionCoarse() if light else LoftrCoarse()
+        elif config.coarse == "cosine":
+            self.coarse = CosineCoarse()
+        else:
+            raise ConfigError(f"network.coarse must be attention or cosine, found {config.coarse!r}")
         if config.head == "homography":
             self.head = HomographyHead(config.window, config.radius, config.iterations, config.margin)
         elif config.head == "expectation":
             self.head = ExpectationHead(config.window, config.margin)
         else:
             raise ConfigError(f"network.head must be homography or expectation, found {config.head!r}")
-
-    @property
-    def frozen(self) -> list[nn.Module]:
-        """The parts that come from public weights and stay as they are when the fine stage is trained."""
-        return [self.backbone.trunk] if self.config.backbone == "light" else [self.backbone, self.coarse]
 
 
 @dataclass(frozen=True)
@@ -119,12 +124,11 @@ class HomoMatcher:
         pixels = pad_image(torch.tensor(image.grey, device=self.device), backbone.stride, backbone.standardised)
         with autocast(self.device):
             maps = backbone(pixels)
-        coarse = self.net.coarse.describe(maps.coarse)
-        columns = count_cells(image.scaled_wh[0], backbone.coarse_grid)
-        rows = count_cells(image.scaled_wh[1], backbone.coarse_grid)
+            columns, rows = (count_cells(size, backbone.coarse_grid) for size in image.scaled_wh)
+            coarse = self.net.coarse.describe(maps.coarse[:, :, :rows, :columns])
         y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
         return ImageFeatures(
-            coarse=coarse[0, :, :rows, :columns].flatten(1).T.contiguous(),
+            coarse=coarse[0].flatten(1).T.contiguous(),
             cell=torch.stack([x, y], dim=-1).reshape(-1, 2).to(self.device),
             fine=make_fine_map(maps.fine),
             scaled_wh=image.scaled_wh,
@@ -136,20 +140,35 @@ class HomoMatcher:
         """Match two images by their features; coordinates are px of the stored images."""
         backbone, head = self.net.backbone, self.net.head
         threshold = self.config.coarse_threshold
-        index0, index1, confidence = self.net.coarse.match(features0.coarse, features1.coarse, threshold)
+        with autocast(self.device):
+            index0, index1, confidence = self.net.coarse.match(features0.coarse, features1.coarse, threshold)
         best = confidence.argsort(descending=True, stable=True)[: self.config.max_matches]
         cell0 = fine_cell_of(features0.cell[index0[best]], backbone.coarse_grid, backbone.fine_grid)
         cell1 = fine_cell_of(features1.cell[index1[best]], backbone.coarse_grid, backbone.fine_grid)
-        estimates = []
-        for start in range(0, len(cell0), FINE_CHUNK):
-            chunk = slice(start, start + FINE_CHUNK)
-            first_image = torch.zeros(len(cell0[chunk]), dtype=torch.int64, device=self.device)
-            with autocast(self.device):
-                estimates.append(head(features0.fine, features1.fine, first_image, cell0[chunk], cell1[chunk])[-1])
-        homography = torch.cat([torch.zeros(0, 3, 3, device=self.device)] + [e.homography for e in estimates])
-        log_scale = torch.cat([torch.zeros(0, device=self.device)] + [e.log_scale for e in estimates])
-        regular = is_regular(homography, head.half).cpu().numpy()
-        return self._to_stored(features0, features1, cell0, cell1, homography, log_scale, regular)
+
+        def refine(cell0: Tensor, cell1: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor]:
+            homography, log_scale = [torch.zeros(0, 3, 3, device=self.device)], [torch.zeros(0, device=self.device)]
+            for first in range(0, len(cell0), FINE_CHUNK):
+                chunk = slice(first, first + FINE_CHUNK)
+                image = torch.zeros(len(cell0[chunk]), dtype=torch.int64, device=self.device)
+                begin = {} if start is None else {"start": start[chunk]}
+                with autocast(self.device):
+                    estimate = head(features0.fine, features1.fine, image, cell0[chunk], cell1[chunk], **begin)[-1]
+                homography.append(estimate.homography)
+                log_scale.append(estimate.log_scale)
+            return torch.cat(homography), torch.cat(log_scale)
+
+        found = GridMatches(index0[best], cell1, *refine(cell0, cell1, None))
+        good = scale_from_score(GROWING_SCORE, backbone.fine_grid)
+        count = torch.count_nonzero(found.log_scale < good)
+        if isinstance(head, HomographyHead) and count < self.config.grow_below:
+            columns, rows = (count_cells(size, backbone.coarse_grid) for size in features0.scaled_wh)
+            first, second = fine_cell_of(torch.tensor([[0, 0], [1, 1]]), backbone.coarse_grid, backbone.fine_grid)
+            grid = PatchGrid(columns, rows, int(first[0]), int(second[0] - first[0]), head.half)
+            found = grow_matches(found, grid, refine, features1.fine.size_wh, good, GROWING_ROUNDS)
+            cell0 = grid.to_fine(found.index0)
+        regular = is_regular(found.homography, head.half).cpu().numpy()
+        return self._to_stored(features0, features1, cell0, found.cell1, found.homography, found.log_scale, regular)
 
     def _to_stored(self, features0, features1, cell0, cell1, homography, log_scale, regular) -> PatchMatches:
         """From patch coordinates to px of the stored images; drops irregular patches and those out of an image."""
@@ -163,7 +182,7 @@ class HomoMatcher:
         centre1 = mapped[:, :2] / mapped[:, 2:]
         score = score_from_scale(log_scale.cpu().numpy().astype(np.float64), grid)
         keep = (regular & is_inside(centre0, features0) & is_inside(centre1, features1)).nonzero()[0]
-        keep = keep[np.argsort(-score[keep], kind="stable")]
+        keep = keep[np.argsort(-score[keep], kind="stable")][: self.config.max_matches]
         px_per_cell = np.sqrt(abs(np.linalg.det(features0.stored_from_scaled[:2, :2]))) * grid.stride
         return PatchMatches(
             xy0=centre0[keep],
@@ -214,6 +233,11 @@ def is_inside(xy: np.ndarray, features: ImageFeatures) -> np.ndarray:
 def score_from_scale(log_scale: np.ndarray, grid: Grid) -> np.ndarray:
     """Error scale (P,), log cells -> (P,) in [0, 1]: the probability of an error below 1 px (Laplace)."""
     return 1 - np.exp(-1 / (np.exp(log_scale) * grid.stride))
+
+
+def scale_from_score(score: float, grid: Grid) -> float:
+    """The inverse of score_from_scale."""
+    return -math.log(-math.log(1 - score) * grid.stride)
 
 
 def autocast(device: torch.device) -> torch.autocast:
@@ -301,6 +325,32 @@ def load_loftr(net: HomoNet, path: Path) -> None:
         )
 
 
+def load_parts(net: HomoNet, content: dict, path: Path) -> list[str]:
+    """Put what fits of a weights file into a network, part by part; returns the names of the parts that do not fit.
+
+    content: as read_checkpoint returns it. Raises WeightsError where it is damaged or nothing fits.
+    """
+    state = content.get("state_dict")
+    if not isinstance(state, dict):
+        raise WeightsError(f"{path} is damaged or no hm_sfm weights file: it has no state_dict")
+    parts = {"trunk": "backbone.trunk.", "fine": "backbone.fine.", "coarse": "coarse.", "head": "head."}
+    if net.config.backbone != "light":
+        parts = {"backbone": "backbone.", "coarse": "coarse.", "head": "head."}
+    modules = {name: net.get_submodule(prefix[:-1]) for name, prefix in parts.items()}
+    modules = {name: module for name, module in modules.items() if module.state_dict()}
+    misfits = []
+    for name, module in modules.items():
+        prefix = parts[name]
+        own = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+        if describe_misfit(module.state_dict(), own):
+            misfits.append(name)
+        else:
+            module.load_state_dict(own)
+    if len(misfits) == len(modules):
+        raise WeightsError(f"{path} fits no part of the network: {describe_misfit(net.state_dict(), state)}")
+    return misfits
+
+
 def read_checkpoint(path: Path) -> dict:
     """The content of a weights file or LoFTR checkpoint. Raises WeightsError where it is damaged or no dictionary."""
     try:
@@ -315,11 +365,40 @@ def read_checkpoint(path: Path) -> dict:
 
 
 def fit_state(module: nn.Module, state: dict[str, Tensor], path: Path) -> None:
-    """load_state_dict. Raises WeightsError that names a missing, unexpected or misshapen key."""
-    try:
-        module.load_state_dict(state)
-    except (RuntimeError, TypeError) as error:
-        raise WeightsError(f"{path} does not fit the network: {' '.join(str(error).split())[:300]}") from error
+    """load_state_dict. Raises WeightsError that names the missing, unexpected and misshapen keys."""
+    misfit = describe_misfit(module.state_dict(), state)
+    if misfit:
+        raise WeightsError(f"{path} does not fit the network: {misfit}")
+    module.load_state_dict(state)
+
+
+def describe_misfit(wanted: dict[str, Tensor], found: dict[str, Tensor]) -> str:
+    """Which keys of `found` are missing, unexpected or of another shape, in words; empty where all fit."""
+    if not isinstance(found, dict):
+        return f"it holds a {type(found).__name__} in place of named tensors"
+    # Batch norms count their batches, which nothing uses; older files do without.
+    missing = [key for key in wanted if key not in found and not key.endswith("num_batches_tracked")]
+    unexpected = [str(key) for key in found if key not in wanted]
+    misshapen = [
+        f"{key} ({describe_shape(found[key])}, expected {describe_shape(value)})"
+        for key, value in wanted.items()
+        if key in found and describe_shape(found[key]) != describe_shape(value)
+    ]
+    kinds = {"missing": missing, "unexpected": unexpected, "of another shape": misshapen}
+    return "; ".join(f"{kind}: {shorten_list(keys)}" for kind, keys in kinds.items() if keys)
+
+
+def describe_shape(value: Tensor) -> str:
+    """Such as 64 x 24 x 3 x 3, or `scalar`; the type's name of what is no tensor."""
+    if not isinstance(value, Tensor):
+        return type(value).__name__
+    return " x ".join(map(str, value.shape)) or "scalar"
+
+
+def shorten_list(names: list[str], most: int = 3) -> str:
+    """The first few names, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def check_digest(path: Path) -> None:

@@ -59,11 +59,13 @@ class LoftrBackbone(nn.Module):
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
-    def forward(self, image: Tensor) -> FeatureMaps:
+    def forward(self, image: Tensor, want_fine: bool = True) -> FeatureMaps:
         """image: (B, 1, H, W) float32 in [0, 1], H and W multiples of `stride`."""
         half = self.layer1(F.relu(self.bn1(self.conv1(image))))
         quarter = self.layer2(half)
         eighth = self.layer3_outconv(self.layer3(quarter))
+        if not want_fine:
+            return FeatureMaps(coarse=eighth, fine=None)
         quarter = self.layer2_outconv2(self.layer2_outconv(quarter) + _double(eighth))
         return FeatureMaps(coarse=eighth, fine=self.layer1_outconv2(self.layer1_outconv(half) + _double(quarter)))
 

@@ -24,6 +24,20 @@ def encode_positions(channels: int, height: int, width: int, device: torch.devic
     return torch.stack([x.sin(), x.cos(), y.sin(), y.cos()], dim=1).flatten(0, 1)
 
 
+def place_positions(channels: int, height: int, width: int, device: torch.device | None = None) -> Tensor:
+    """Sinusoidal positions relative to the grid's longer side, (C, H, W) float32, C a multiple of 4.
+
+    Wavelengths from 1/16 of the longer side to four times it: a photo has the same positions at every resolution, so
+    the network may match larger photos than it was trained on.
+    """
+    half_waves = torch.logspace(math.log10(0.5), math.log10(32.0), channels // 4, device=device)
+    longer = max(height, width)
+    y, x = ((torch.arange(size, device=device) + 0.5) / longer for size in (height, width))
+    phase_x = (torch.pi * half_waves[:, None, None] * x).expand(-1, height, -1)
+    phase_y = (torch.pi * half_waves[:, None, None] * y[:, None]).expand(-1, -1, width)
+    return torch.cat([phase_x.sin(), phase_x.cos(), phase_y.sin(), phase_y.cos()])
+
+
 class AttentionLayer(nn.Module):
     """One encoder layer: what `x` gathers from `source` by linear attention, and a feed-forward network over both."""
 
@@ -75,10 +89,13 @@ class CoarseTransformer(nn.Module):
             if parameter.dim() > 1:
                 nn.init.xavier_uniform_(parameter)
 
-    def forward(self, coarse0: Tensor, coarse1: Tensor) -> tuple[Tensor, Tensor]:
-        """coarse0: (B, N0, C), coarse1: (B, N1, C). Returns both, each aware of the other."""
-        for self_layer, cross_layer in zip(self.layers[::2], self.layers[1::2]):
-            coarse0, coarse1 = self_layer(coarse0, coarse0), self_layer(coarse1, coarse1)
-            coarse0 = cross_layer(coarse0, coarse1)
-            coarse1 = cross_layer(coarse1, coarse0)
+    def forward(self, coarse0: Tensor, coarse1: Tensor, first_layer: int = 0) -> tuple[Tensor, Tensor]:
+        """coarse0: (B, N0, C), coarse1: (B, N1, C), after the layers before `first_layer`. Returns both, each aware of
+        the other."""
+        for number, layer in enumerate(self.layers[first_layer:], start=first_layer):
+            if number % 2:
+                coarse0 = layer(coarse0, coarse1)
+                coarse1 = layer(coarse1, coarse0)
+            else:
+                coarse0, coarse1 = layer(coarse0, coarse0), layer(coarse1, coarse1)
         return coarse0, coarse1

@@ -140,9 +140,7 @@ def test_no_cells_match_nothing(counts):
     assert index0.dtype == index1.dtype == torch.int64
 
 
-@pytest.mark.parametrize(
-    "head", [HomographyHead(9, 1, 3, 2), ExpectationHead(9, 2)], ids=["homography", "expectation"]
-)
+@pytest.mark.parametrize("head", [HomographyHead(9, 1, 3, 2), ExpectationHead(9, 2)], ids=["homography", "expectation"])
 def test_heads_take_no_patches(head):
     fine = make_fine_map(torch.zeros(1, 48, 8, 8))
     none = torch.zeros(0, 2, dtype=torch.int64)

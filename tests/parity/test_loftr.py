@@ -8,11 +8,11 @@ from kornia.feature import LoFTR
 
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, load_config
 from hm_sfm.errors import WeightsError
-from hm_sfm.network.coarse import make_confidences, match_by_dual_softmax
+from hm_sfm.network.coarse import SHARPNESS, make_log_confidences, match_by_dual_softmax
 from hm_sfm.network.model import HomoMatcher, HomoNet, load_weights
 from hm_sfm.network.transformer import attend_linearly
 
-LOFTR = NetworkConfig(backbone="loftr", head="expectation", margin=0)
+LOFTR = NetworkConfig(backbone="loftr", coarse="attention", head="expectation", margin=0)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_coarse_confidences_equal_kornias(kornia_net, checkpoint, size_hw):
         net.coarse.describe(net.backbone(image).coarse).flatten(2).transpose(1, 2) for image in (image0, image1)
     ]
     aware0, aware1 = net.coarse(*described)
-    ours = torch.cat(list(make_confidences(aware0[0] / (256 * 0.1), aware1[0], block=50)))
+    ours = torch.cat(list(make_log_confidences(aware0[0] * SHARPNESS / 256, aware1[0], block=50))).exp()
     assert torch.allclose(ours, data["conf_matrix"][0], atol=1e-4)
     assert ours.max() > 10 * ours.mean()
 
@@ -79,7 +79,9 @@ def test_blocked_dual_softmax_equals_the_naive_one(block):
     coarse0 = 3 * torch.randn(150, 32, generator=generator)
     coarse1 = torch.cat([coarse0[20:90], 3 * torch.randn(60, 32, generator=generator)])
     expected, confidence = naive_dual_softmax(coarse0, coarse1, 0.2)
-    index0, index1, score = match_by_dual_softmax(coarse0, coarse1, 0.2, block=block)
+    index0, index1, score = match_by_dual_softmax(
+        coarse0, coarse1, 0.2, torch.tensor(10 / coarse0.shape[1]), block=block
+    )
     assert len(expected) > 50
     assert torch.equal(torch.stack([index0, index1], dim=1), expected)
     assert torch.allclose(score, confidence[index0, index1], rtol=1e-4)
@@ -87,7 +89,9 @@ def test_blocked_dual_softmax_equals_the_naive_one(block):
 
 @pytest.mark.parametrize("counts", [(0, 5), (5, 0), (0, 0)])
 def test_dual_softmax_of_nothing(counts):
-    index0, index1, score = match_by_dual_softmax(torch.ones(counts[0], 8), torch.ones(counts[1], 8), 0.2)
+    index0, index1, score = match_by_dual_softmax(
+        torch.ones(counts[0], 8), torch.ones(counts[1], 8), 0.2, torch.tensor(1.25)
+    )
     assert len(index0) == len(index1) == len(score) == 0
 
 
@@ -110,7 +114,7 @@ def test_a_loftr_checkpoint_matches_images(checkpoint):
 
 def test_a_loftr_checkpoint_has_no_homography_head(checkpoint):
     with pytest.raises(WeightsError, match="loftr.ckpt has no homography head"):
-        load_weights(str(checkpoint), NetworkConfig(backbone="loftr"))
+        load_weights(str(checkpoint), NetworkConfig(backbone="loftr", coarse="attention"))
 
 
 def test_a_checkpoint_that_lacks_keys_is_refused(kornia_net, tmp_path):

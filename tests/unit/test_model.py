@@ -13,7 +13,16 @@ from hm_sfm import HomoMatcher
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig
 from hm_sfm.errors import ConfigError, InputError, WeightsError
 from hm_sfm.network import model
-from hm_sfm.network.model import HomoNet, digest_weights, load_weights, pick_device, save_weights, score_from_scale
+from hm_sfm.network.model import (
+    HomoNet,
+    digest_weights,
+    load_parts,
+    load_weights,
+    pick_device,
+    save_weights,
+    scale_from_score,
+    score_from_scale,
+)
 from hm_sfm.types import PatchMatches
 
 
@@ -116,6 +125,51 @@ def test_the_number_of_iterations_may_differ_from_the_training():
         load_weights("light", NetworkConfig(iterations=0))
 
 
+def test_what_does_not_fit_is_named_by_its_keys(tmp_path, small_net):
+    state = small_net.state_dict()
+    names = [name for name in state if name.startswith("head.")]
+    shape = " x ".join(map(str, state[names[0]].shape))
+    changed = {name: value for name, value in state.items() if name not in names[1:6]}
+    changed |= {names[0]: torch.zeros(7), "head.hidden": torch.zeros(1)}
+    path = tmp_path / "changed.pt"
+    torch.save({"network": dataclasses.asdict(small_net.config), "state_dict": changed}, path)
+    with pytest.raises(WeightsError) as error:
+        load_weights(str(path))
+    assert str(error.value) == (
+        f"{path} does not fit the network: missing: {', '.join(names[1:4])} and 2 more; unexpected: head.hidden; "
+        f"of another shape: {names[0]} (7, expected {shape})"
+    )
+
+
+@pytest.mark.parametrize("coarse", ["attention", "cosine"])
+def test_parts_that_do_not_fit_start_new(tmp_path, small_net, coarse):
+    """From a network with another window to one with or without attention: the trunk, and what else fits, is kept."""
+    source = HomoNet(NetworkConfig(coarse="attention", window=5, iterations=1, margin=0))
+    state = source.state_dict()
+    del state["backbone.fine.local.0.weight"]
+    state["head.extra"] = torch.zeros(2)
+    net = HomoNet(NetworkConfig(coarse=coarse, window=5, iterations=1, margin=0))
+    before = {name: value.clone() for name, value in net.state_dict().items()}
+    assert load_parts(net, {"state_dict": state}, tmp_path / "a.pt") == ["fine", "head"]
+    for name, value in net.state_dict().items():
+        kept = name.startswith(("backbone.trunk.", "coarse."))
+        assert torch.equal(value, state[name] if kept else before[name])
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        ({}, "fits no part of the network: missing: backbone.trunk"),
+        ({"fc.weight": torch.zeros(3)}, "missing: .* more; unexpected: fc.weight$"),
+        ({"backbone.trunk.skip1.1.weight": 5}, r"of another shape: .*skip1.1.weight \(int, expected 24 x 1 x 1 x 1\)"),
+        ([1], "it has no state_dict"),
+    ],
+)
+def test_weights_of_which_nothing_fits_are_refused(tmp_path, small_net, state, message):
+    with pytest.raises(WeightsError, match=f"a.pt.*{message}"):
+        load_parts(small_net, {"state_dict": state}, tmp_path / "a.pt")
+
+
 def test_one_flipped_byte_in_the_bundled_weights_is_noticed(tmp_path, monkeypatch):
     folder = tmp_path / "weights"
     shutil.copytree(model.WEIGHTS_FOLDER, folder)
@@ -209,9 +263,7 @@ def test_colour_arrays_are_rgb(matcher, tmp_path):
     layers = [make_texture(190, 120, seed) for seed in range(3)]
     arrays, paths = write_pair(tmp_path, np.stack(layers, axis=-1))
     by_array, by_path = matcher.match(*arrays), matcher.match(*paths)
-    common, at_array, at_path = np.intersect1d(
-        by_array.xy0 @ [1, 1000], by_path.xy0 @ [1, 1000], return_indices=True
-    )
+    common, at_array, at_path = np.intersect1d(by_array.xy0 @ [1, 1000], by_path.xy0 @ [1, 1000], return_indices=True)
     assert len(common) > 0.9 * max(len(by_array), len(by_path)) > 50
     apart = np.linalg.norm(by_array.xy1[at_array] - by_path.xy1[at_path], axis=1)
     assert np.median(apart) < 0.05
@@ -336,3 +388,30 @@ def test_densify_uses_a_patch_for_its_own_pixels_wherever_its_centre_lies(radius
 def test_densify_refuses_what_the_homographies_do_not_cover(radius):
     with pytest.raises(ValueError, match="radius"):
         two_patches().densify(radius)
+
+
+def test_the_scale_of_a_score_gives_the_score():
+    grid = model.LightBackbone.fine_grid
+    for score in (0.1, 0.5, 0.9):
+        assert score_from_scale(np.array([scale_from_score(score, grid)]), grid)[0] == pytest.approx(score)
+
+
+def test_pairs_with_few_good_matches_grow_more():
+    """A turn of 30 degrees, which the coarse features bear in places only."""
+    image = make_texture(320, 256)
+    turn = np.vstack([cv2.getRotationMatrix2D((160, 128), 30, 1), [0, 0, 1]])
+    turned = cv2.warpAffine(image, turn[:2], (320, 256), flags=cv2.INTER_CUBIC)
+
+    def match(grow_below: int) -> PatchMatches:
+        matcher = HomoMatcher.from_pretrained("light", config=MatchingConfig(grow_below=grow_below))
+        found = matcher.match(image, turned)
+        return found.select(np.flatnonzero(found.score >= 0.5))
+
+    few, many = match(0), match(10_000)
+    assert len(few) >= 5 and len(many) > 1.5 * len(few)
+    # OpenCV's frame has the centre of the first pixel at (0, 0).
+    true = cv2.transform(many.xy0[None] - 0.5, turn[:2])[0] + 0.5
+    assert np.median(np.linalg.norm(many.xy1 - true, axis=1)) < 0.5
+    # Where there are enough good matches, nothing changes.
+    enough = match(len(few))
+    assert np.array_equal(enough.xy0, few.xy0) and np.array_equal(enough.xy1, few.xy1)

@@ -39,6 +39,11 @@ class Quad:
         if not np.cross(self.edge_u, self.edge_v).any():
             raise ValueError(f"the edges of a quad must not be parallel, got {self.edge_u} and {self.edge_v}")
 
+    @property
+    def corners(self) -> np.ndarray:
+        """(4, 3) float64."""
+        return self.origin + np.outer([0, 1, 0, 1], self.edge_u) + np.outer([0, 0, 1, 1], self.edge_v)
+
 
 @dataclass(frozen=True)
 class Rendering:
@@ -59,7 +64,7 @@ def render_view(
     colours = np.empty((*nearest.shape, 3), dtype=np.float32)
     colours[:] = background_rgb
     for index, quad in enumerate(quads):
-        box = _find_box(quad, view, SAMPLES)
+        box = find_box(quad.corners, view, SAMPLES)
         rows, columns = np.nonzero(nearest[box] == index)
         if len(rows):
             rows, columns = rows + box[0].start, columns + box[1].start
@@ -69,28 +74,30 @@ def render_view(
     return Rendering(np.clip(np.rint(mean), 0, 255).astype(np.uint8), depth)
 
 
-def find_surfaces(quads: tuple[Quad, ...], view: PinholeView) -> np.ndarray:
-    """(H, W) int32: which quad the centre of each pixel shows, -1 where there is none."""
-    return _find_nearest(quads, view, samples=1)[0]
-
-
-def _uvw_from_px(quad: Quad, view: PinholeView) -> np.ndarray | None:
-    """(3, 3): px (x, y, 1) -> (u, v, 1) / z-depth of the quad's plane, all affine in x and y. None if edge-on."""
+def frame_in_camera(quad: Quad, view: PinholeView) -> np.ndarray:
+    """(3, 3) float64: (u, v, 1) of a quad's plane -> the point in the camera's frame."""
     rotation, translation = view.cam_from_world[:, :3], view.cam_from_world[:, 3]
-    frame = np.column_stack([rotation @ quad.edge_u, rotation @ quad.edge_v, rotation @ quad.origin + translation])
+    return np.column_stack([rotation @ quad.edge_u, rotation @ quad.edge_v, rotation @ quad.origin + translation])
+
+
+def uvw_from_px(quad: Quad, view: PinholeView) -> np.ndarray | None:
+    """(3, 3): px (x, y, 1) -> (u, v, 1) / z-depth of the quad's plane, all affine in x and y. None if edge-on."""
+    frame = frame_in_camera(quad, view)
     if abs(np.linalg.det(frame)) < 1e-12:
         return None
     return np.linalg.inv(frame) @ np.linalg.inv(view.K)
 
 
-def _find_box(quad: Quad, view: PinholeView, samples: int) -> tuple[slice, slice]:
-    """Rows and columns of the sample grid that hold all of the quad that is in the image."""
-    corners = quad.origin + np.outer([0, 1, 0, 1], quad.edge_u) + np.outer([0, 0, 1, 1], quad.edge_v)
+def find_box(corners: np.ndarray, view: PinholeView, samples: int = 1) -> tuple[slice, slice]:
+    """Rows and columns of the grid of samples x samples points per pixel that hold all of a polygon in the image.
+
+    corners: (N, 3) world. Two empty slices where there is nothing of it.
+    """
     size = np.array(view.size_wh) * samples
     xy_px, depth = view.project(corners)
     if (depth < NEAR_M).all():
         return slice(0, 0), slice(0, 0)
-    if (depth < NEAR_M).any():  # the quad reaches behind the camera: its corners don't bound it
+    if (depth < NEAR_M).any():  # it reaches behind the camera: its corners don't bound it
         low, high = np.zeros(2, int), size
     else:
         low = np.clip(np.floor(xy_px.min(axis=0) * samples), 0, size).astype(int)
@@ -104,13 +111,13 @@ def _find_nearest(quads: tuple[Quad, ...], view: PinholeView, samples: int) -> t
     nearest = np.full((height * samples, width * samples), -1, dtype=np.int32)
     inverse_depth = np.zeros(nearest.shape)
     for index, quad in enumerate(quads):
-        uvw_from_px = _uvw_from_px(quad, view)
-        if uvw_from_px is None:
+        matrix = uvw_from_px(quad, view)
+        if matrix is None:
             continue
-        box = _find_box(quad, view, samples)
+        box = find_box(quad.corners, view, samples)
         x = (np.arange(box[1].start, box[1].stop) + 0.5) / samples
         y = (np.arange(box[0].start, box[0].stop) + 0.5) / samples
-        u, v, w = (a * x + (b * y + c)[:, None] for a, b, c in uvw_from_px)
+        u, v, w = (a * x + (b * y + c)[:, None] for a, b, c in matrix)
         # u and v are still divided by the depth, so they are compared with w = 1 / depth instead of 1.
         seen = (w > inverse_depth[box]) & (w < 1 / NEAR_M) & (u >= 0) & (u <= w) & (v >= 0) & (v <= w)
         nearest[box][seen] = index
@@ -120,7 +127,7 @@ def _find_nearest(quads: tuple[Quad, ...], view: PinholeView, samples: int) -> t
 
 def _colour_samples(quad: Quad, view: PinholeView, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Lit colours (N, 3) float32 of a quad at samples of the SAMPLES-fold grid that see it."""
-    m = _uvw_from_px(quad, view)
+    m = uvw_from_px(quad, view)
     x, y = (columns + 0.5) / SAMPLES, (rows + 0.5) / SAMPLES
     u, v, w = (a * x + b * y + c for a, b, c in m)
     u, v = u / w, v / w

@@ -133,9 +133,7 @@ def test_shading_tells_the_faces_of_a_box_apart():
 
 def test_box_is_closed_and_of_the_stated_size():
     quads = make_box(np.random.default_rng(0), "paint", (1, 2), (3, 2, 1), 90, base_m=0.5, texels_per_m=8)
-    corners = np.concatenate(
-        [q.origin + np.array([(0, 0, 0), q.edge_u, q.edge_v, q.edge_u + q.edge_v]) for q in quads]
-    )
+    corners = np.concatenate([q.origin + np.array([(0, 0, 0), q.edge_u, q.edge_v, q.edge_u + q.edge_v]) for q in quads])
     assert len(np.unique(corners.round(9), axis=0)) == 8
     assert corners.min(axis=0) == pytest.approx([0, 0.5, 0.5]) and corners.max(axis=0) == pytest.approx([2, 3.5, 1.5])
 

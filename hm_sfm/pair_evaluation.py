@@ -3,7 +3,7 @@
 The protocols are LoFTR's (Sun et al., CVPR 2021, section 4), which HomoMatcher's tables follow.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -18,7 +18,7 @@ from hm_sfm.errors import InputError
 from hm_sfm.evaluation import measure_angle_deg, measure_rotation_deg, pose_auc, read_strecha_cameras, relative_pose
 from hm_sfm.images import prepare_image, read_ref
 from hm_sfm.network.model import HomoMatcher, ImageFeatures
-from hm_sfm.types import PatchMatches
+from hm_sfm.types import PatchMatches, freeze_array
 
 POSE_THRESHOLDS_DEG = (5, 10, 20)
 CORNER_THRESHOLDS_PX = (3, 5, 10)
@@ -38,6 +38,23 @@ class PosePair:
     """(3, 3), px of the stored images, COLMAP's frame."""
     cam1_from_cam0: np.ndarray
     """(3, 4)."""
+
+
+@dataclass(frozen=True)
+class PointMatches:
+    """Matches of two images as points only: what any matcher gives."""
+
+    xy0: np.ndarray
+    """(M, 2) float32 px of stored image 0, COLMAP's frame."""
+    xy1: np.ndarray
+    """(M, 2) float32 px of stored image 1."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "xy0", freeze_array(self.xy0, np.float32, (None, 2), "xy0"))
+        object.__setattr__(self, "xy1", freeze_array(self.xy1, np.float32, (len(self.xy0), 2), "xy1"))
+
+    def __len__(self) -> int:
+        return len(self.xy0)
 
 
 def read_strecha_pairs(scene: Path) -> list[PosePair]:
@@ -93,20 +110,42 @@ def read_superglue_pairs(path: Path, image_folder: Path) -> list[PosePair]:
     return pairs
 
 
-def score_poses(matcher: HomoMatcher, pairs: Sequence[PosePair], quiet: bool = False) -> dict[str, float]:
+def score_poses(
+    matcher: HomoMatcher,
+    pairs: Sequence[PosePair],
+    quiet: bool = False,
+    observe: Callable[[PosePair, PatchMatches], None] | None = None,
+) -> dict[str, float]:
+    """score_pose_matches of a HomoMatcher's matches; each photo is encoded once."""
+    features = {}
+
+    def match(path0: Path, path1: Path) -> PatchMatches:
+        for path in (path0, path1):
+            if path not in features:
+                features[path] = matcher.encode(prepare_image(read_ref(path), matcher.images.long_edge_px))
+        return matcher.match_features(features[path0], features[path1])
+
+    return score_pose_matches(match, pairs, quiet, observe)
+
+
+def score_pose_matches(
+    match: Callable[[Path, Path], PatchMatches | PointMatches],
+    pairs: Sequence[PosePair],
+    quiet: bool = False,
+    observe: Callable[[PosePair, PatchMatches | PointMatches], None] | None = None,
+) -> dict[str, float]:
     """Match the pairs and estimate their relative poses, by OpenCV's RANSAC as LoFTR does and by COLMAP's LO-RANSAC.
 
+    match: two photos -> their matches, px of the stored images; observe: called with each pair and its matches.
     Returns, by name: the AUC of pose errors (the larger of rotation and translation direction; the latter up to its
     sign, as in LoFTR) at 5, 10 and 20 degrees in percent for both, and the mean number of matches.
     """
-    features = {}
     errors: dict[str, list[float]] = {"opencv": [], "colmap": []}
     counts = []
     for pair in tqdm(pairs, desc="poses", unit="pair", disable=quiet):
-        for path in (pair.path0, pair.path1):
-            if path not in features:
-                features[path] = matcher.encode(prepare_image(read_ref(path), matcher.images.long_edge_px))
-        matches = matcher.match_features(features[pair.path0], features[pair.path1])
+        matches = match(pair.path0, pair.path1)
+        if observe is not None:
+            observe(pair, matches)
         counts.append(len(matches))
         for name, estimate in (("opencv", estimate_pose_opencv), ("colmap", estimate_pose_colmap)):
             errors[name].append(measure_pose_error(estimate(matches, pair.k0, pair.k1), pair.cam1_from_cam0))
@@ -118,7 +157,7 @@ def score_poses(matcher: HomoMatcher, pairs: Sequence[PosePair], quiet: bool = F
     return scores | {"mean_matches": float(np.mean(counts))}
 
 
-def estimate_pose_opencv(matches: PatchMatches, k0: np.ndarray, k1: np.ndarray) -> np.ndarray | None:
+def estimate_pose_opencv(matches: PatchMatches | PointMatches, k0: np.ndarray, k1: np.ndarray) -> np.ndarray | None:
     """cam1_from_cam0 (3, 4), translation of unit length, as LoFTR estimates it; None where it fails."""
     if len(matches) < 5:
         return None
@@ -138,7 +177,9 @@ def estimate_pose_opencv(matches: PatchMatches, k0: np.ndarray, k1: np.ndarray) 
     return np.column_stack([best[1], best[2]])
 
 
-def estimate_pose_colmap(matches: PatchMatches, k0: np.ndarray, k1: np.ndarray) -> np.ndarray | None:
+def estimate_pose_colmap(
+    matches: PatchMatches | PointMatches, k0: np.ndarray, k1: np.ndarray, max_error_px: float = ESSENTIAL_ERROR_PX
+) -> np.ndarray | None:
     """cam1_from_cam0 (3, 4), translation of unit length, by COLMAP's LO-RANSAC; None where it fails."""
     if len(matches) < 5:
         return None
@@ -147,7 +188,7 @@ def estimate_pose_colmap(matches: PatchMatches, k0: np.ndarray, k1: np.ndarray) 
         pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
         for k in (k0, k1)
     )
-    options = pycolmap.RANSACOptions(max_error=ESSENTIAL_ERROR_PX, random_seed=0)
+    options = pycolmap.RANSACOptions(max_error=max_error_px, random_seed=0)
     xy0, xy1 = matches.xy0.astype(np.float64), matches.xy1.astype(np.float64)
     found = pycolmap.estimate_essential_matrix(xy0, xy1, camera0, camera1, options)
     return None if found is None else found["cam2_from_cam1"].matrix()
@@ -161,36 +202,48 @@ def measure_pose_error(found: np.ndarray | None, true: np.ndarray) -> float:
     return max(measure_rotation_deg(found[:, :3], true[:, :3]), min(direction_deg, 180 - direction_deg))
 
 
-def score_homographies(matcher: HomoMatcher, folder: Path, quiet: bool = False) -> dict[str, float]:
+def score_homographies(
+    matcher: HomoMatcher,
+    folder: Path,
+    quiet: bool = False,
+    observe: Callable[[Path, Path, np.ndarray, PatchMatches], None] | None = None,
+) -> dict[str, float]:
     """Match the pairs of a folder in HPatches' layout and estimate the homographies between the images.
 
     folder: a subfolder a sequence with images 1.* to 6.* and H_1_2 to H_1_6. Short edges are reduced to 480 px.
-    Returns the AUC of the mean corner error at 3, 5 and 10 px of the reduced image 1, in percent, and the mean number
-    of matches. Raises InputError where the layout is another.
+    observe: called with the two paths, the true homography (3, 3) between the stored images, and the matches of each
+    pair. Returns the AUC of the mean corner error at 3, 5 and 10 px of the reduced image 1, in percent, and the mean
+    number of matches. Raises InputError where the layout is another.
     """
     sequences = sorted(path.parent for path in Path(folder).glob("*/H_1_2"))
     if not sequences:
         raise InputError(f"{folder} is no folder in HPatches' layout: no */H_1_2 there")
     errors, counts = [], []
     for sequence in tqdm(sequences, desc="homographies", unit="sequence", disable=quiet):
-        features0, size_wh, _ = _encode_short_edge(matcher, sequence, 1)
+        path0 = _find_image(sequence, 1)
+        features0, size_wh, _ = _encode_short_edge(matcher, path0)
         for number in range(2, 7):
-            features1, _, px_per_unit1 = _encode_short_edge(matcher, sequence, number)
+            path1 = _find_image(sequence, number)
+            features1, _, px_per_unit1 = _encode_short_edge(matcher, path1)
             matches = matcher.match_features(features0, features1)
             truth = homography_from_pixel_index(np.loadtxt(sequence / f"H_1_{number}"))
+            if observe is not None:
+                observe(path0, path1, truth, matches)
             counts.append(len(matches))
             errors.append(_measure_corner_error(matches, truth, size_wh, px_per_unit1))
     scores = {f"auc_{limit}px": area for limit, area in pose_auc(np.array(errors), CORNER_THRESHOLDS_PX).items()}
     return scores | {"mean_matches": float(np.mean(counts))}
 
 
-def _encode_short_edge(
-    matcher: HomoMatcher, sequence: Path, number: int
-) -> tuple[ImageFeatures, tuple[int, int], float]:
-    """Features, stored size (w, h) px and stored px per reduced px of image `number` of a sequence."""
+def _find_image(sequence: Path, number: int) -> Path:
     path = next(iter(sorted(sequence.glob(f"{number}.*"))), None)
     if path is None:
         raise InputError(f"{sequence} lacks the image {number}.*")
+    return path
+
+
+def _encode_short_edge(matcher: HomoMatcher, path: Path) -> tuple[ImageFeatures, tuple[int, int], float]:
+    """Features, stored size (w, h) px and stored px per reduced px of an image."""
     ref = read_ref(path)
     px_per_unit = max(1.0, min(ref.size_wh) / HPATCHES_SHORT_EDGE_PX)
     features = matcher.encode(prepare_image(ref, round(max(ref.size_wh) / px_per_unit)))

@@ -7,12 +7,15 @@ from hm_sfm.errors import InputError
 from hm_sfm.evaluation import write_strecha_cameras
 from hm_sfm.network.model import HomoMatcher
 from hm_sfm.pair_evaluation import (
+    PointMatches,
+    PosePair,
     estimate_pose_colmap,
     estimate_pose_opencv,
     measure_pose_error,
     read_strecha_pairs,
     read_superglue_pairs,
     score_homographies,
+    score_pose_matches,
 )
 from hm_sfm.textures import make_texture
 from hm_sfm.types import PatchMatches, PinholeView
@@ -48,6 +51,30 @@ def test_too_few_matches_give_no_pose(estimate):
     pose = make_pose(5, (1, 0, 0))
     assert estimate(make_matches(pose, count=4, outliers=0), K0, K1) is None
     assert measure_pose_error(None, pose) == np.inf
+
+
+def test_any_matcher_can_be_scored():
+    pose = make_pose(12, (1.0, 0.1, 0.2))
+    asked = []
+
+    def match(path0, path1):
+        asked.append((path0, path1))
+        matches = make_matches(pose)
+        return (
+            PointMatches(matches.xy0, matches.xy1) if path0 == "a" else PointMatches(matches.xy0[:4], matches.xy1[:4])
+        )
+
+    pairs = [PosePair("a", "b", K0, K1, pose), PosePair("b", "c", K0, K1, pose)]
+    scores = score_pose_matches(match, pairs, quiet=True)
+    assert asked == [("a", "b"), ("b", "c")]
+    assert scores["mean_matches"] == 202
+    for name in ("opencv", "colmap"):
+        assert 45 < scores[f"{name}_auc_5deg"] < scores[f"{name}_auc_20deg"] < 75
+
+
+def test_points_of_two_images_must_be_as_many():
+    with pytest.raises(ValueError, match="xy1"):
+        PointMatches(np.zeros((3, 2)), np.zeros((2, 2)))
 
 
 def test_a_pose_error_is_the_larger_angle_and_ignores_the_sign_of_the_translation():

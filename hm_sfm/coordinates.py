@@ -33,6 +33,11 @@ def px_from_pixel_index(index: Array) -> Array:
     return index + 0.5
 
 
+def pixel_index_from_px(xy_px: Array) -> Array:
+    """COLMAP px (..., 2) -> OpenCV's indices, where pixel centres are integers."""
+    return xy_px - 0.5
+
+
 def homography_to_pixel_index(homography_px: np.ndarray) -> np.ndarray:
     """(..., 3, 3) homographies between COLMAP px -> the same between OpenCV's indices (for warpPerspective)."""
     half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])

@@ -23,6 +23,10 @@ class StaleResultError(HmSfmError):
     """A stored result was made from other inputs or another configuration than the present ones."""
 
 
+class MissingPackageError(HmSfmError):
+    """A package that only some commands need is not installed."""
+
+
 class NoModelError(HmSfmError):
     """The mapper found no model; database and matches are kept."""
 

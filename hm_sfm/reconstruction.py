@@ -18,6 +18,7 @@ from hm_sfm.atomic import replace_file
 from hm_sfm.config import Config, fingerprint
 from hm_sfm.database import Cameras, make_cameras, write_database
 from hm_sfm.errors import InputError, NoModelError
+from hm_sfm.hloc import write_features, write_matches
 from hm_sfm.images import list_images, prepare_image
 from hm_sfm.keypoints import Photo, find_seeds, persist_keypoints
 from hm_sfm.mapping import VerifiedPair, map_incrementally, summarise_models, verify_database, verify_pairs
@@ -68,25 +69,50 @@ def match_photos(image_folder: Path, out: Path, config: Config, quiet: bool = Fa
 def export_database(image_folder: Path, out: Path, config: Config, quiet: bool = False) -> Matched:
     """As match_photos, then OUT/database.db with persistent keypoints and verified matches."""
     matched = match_photos(image_folder, out, config, quiet)
-    out, images = Path(out), matched.images
-    px_per_unit = measure_units(images, config)
-    cameras = {image.name: matched.cameras.cameras[i] for image, i in zip(images, matched.cameras.camera_index)}
+    keypoints, matches = verify_and_carry(matched, config, quiet)
     with stopwatch(matched.seconds, "verify"):
-        verified = verify_pairs(
-            images, matched.pairs, matched.store.read, cameras, px_per_unit, config.verification, quiet
-        )
-    with stopwatch(matched.seconds, "keypoints"):
-        keypoints, matches = carry_keypoints(images, verified, matched.store, config, quiet)
-    with stopwatch(matched.seconds, "verify"):
-        database = out / "database.db"
-        write_database(database, images, matched.cameras, keypoints, matches)
+        database = Path(out) / "database.db"
+        write_database(database, matched.images, matched.cameras, keypoints, matches)
         verify_database(
             database,
-            config.verification.max_error_px * max(px_per_unit.values()),
+            config.verification.max_error_px * max(measure_units(matched.images, config).values()),
             config.verification.min_inliers,
             config.verification.min_inlier_ratio,
         )
     return matched
+
+
+def export_hloc(image_folder: Path, out: Path, config: Config, quiet: bool = False) -> Matched:
+    """As match_photos, then OUT/hloc/features.h5 and OUT/hloc/matches.h5 with persistent keypoints, as hloc reads them.
+
+    The pairs are those of OUT/pairs.txt. Raises InputError where image names differ in "/" and "-" only.
+    """
+    matched = match_photos(image_folder, out, config, quiet)
+    keypoints, matches = verify_and_carry(matched, config, quiet)
+    folder = Path(out) / "hloc"
+    write_features(folder / "features.h5", matched.images, keypoints, measure_units(matched.images, config))
+    write_matches(folder / "matches.h5", matched.pairs, keypoints, matches)
+    return matched
+
+
+def verify_and_carry(
+    matched: Matched, config: Config, quiet: bool = False
+) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
+    """Persistent keypoints from matches: verify_pairs, then carry_keypoints; adds to the seconds of `matched`."""
+    images = matched.images
+    cameras = {image.name: matched.cameras.cameras[i] for image, i in zip(images, matched.cameras.camera_index)}
+    with stopwatch(matched.seconds, "verify"):
+        verified = verify_pairs(
+            images,
+            matched.pairs,
+            matched.store.read,
+            cameras,
+            measure_units(images, config),
+            config.verification,
+            quiet,
+        )
+    with stopwatch(matched.seconds, "keypoints"):
+        return carry_keypoints(images, verified, matched.store, config, quiet)
 
 
 def reconstruct(image_folder: Path, out: Path, config: Config, quiet: bool = False) -> MappingResult:

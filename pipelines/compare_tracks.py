@@ -1,0 +1,75 @@
+"""How long are the tracks? The same photos by persistent keypoints, and by matches as LoFTR's users take them.
+
+    python pipelines/compare_tracks.py PHOTOS OUT [GROUND_TRUTH]
+
+Matches of two heads on the same features become keypoints in three ways: carried by homographies; the expectation
+head's points as they are; and its points snapped to 1 px, as hloc does it. Everything after that is the same. What
+`hm-sfm compare` does with more methods, to copy and change. GROUND_TRUTH holds <image name>.camera files.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from hm_sfm.comparison import load_expectation, load_matcher, read_tracks
+from hm_sfm.config import Config
+from hm_sfm.database import make_cameras, write_database
+from hm_sfm.evaluation import read_strecha_cameras, score_model
+from hm_sfm.images import list_images
+from hm_sfm.loftr_style import make_keypoints
+from hm_sfm.mapping import map_incrementally, summarise_models, verify_database, verify_pairs
+from hm_sfm.matching import match_pairs
+from hm_sfm.pairs import select_pairs
+from hm_sfm.reconstruction import carry_keypoints, claim_folder, describe_matching, measure_units
+from hm_sfm.store import MatchStore, digest_image
+
+
+def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:
+    config = Config()
+    checks = config.verification
+    claim_folder(out)
+    images = list_images(photos).images
+    pairs = select_pairs([image.name for image in images], config.pairs)
+    cameras = make_cameras(images, config.cameras)
+    px_per_unit = measure_units(images, config)
+
+    # Each head's matches of the same pairs, stored side by side.
+    digests = {image.name: digest_image(image) for image in images}
+    homographies = MatchStore(out / "homographies.h5", describe_matching(config), digests)
+    match_pairs(images, pairs, load_matcher(config), homographies)
+    matcher, made_by = load_expectation("light_expectation", config)
+    expectations = MatchStore(out / "expectations.h5", made_by, digests)
+    match_pairs(images, pairs, matcher, expectations)
+
+    # Three ways from matches to keypoints.
+    camera_of = {image.name: cameras.cameras[index] for image, index in zip(images, cameras.camera_index)}
+    verified = verify_pairs(images, pairs, homographies.read, camera_of, px_per_unit, checks)
+    budget = config.keypoints.max_keypoints
+    found = {
+        "persistent": carry_keypoints(images, verified, homographies, config),
+        "raw": make_keypoints(images, pairs, expectations.read, px_per_unit, None, budget),
+        "snapped": make_keypoints(images, pairs, expectations.read, px_per_unit, 1, budget),
+    }
+
+    # The same verification and mapping for all, and what became of the tracks.
+    for name, (keypoints, matches) in found.items():
+        (out / name).mkdir(exist_ok=True)
+        database = out / name / "database.db"
+        write_database(database, images, cameras, keypoints, matches)
+        max_error_px = checks.max_error_px * max(px_per_unit.values())
+        verify_database(database, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
+        models = map_incrementally(database, photos, out / name / "sparse", config.mapping, fix_intrinsics=False)
+        result = summarise_models(models, len(images))
+        print(f"{name}: {result.registered} of {len(images)} images, {result.points} points", end=", ")
+        print(f"tracks of {result.mean_track_length:.2f} images, {result.mean_reprojection_px:.3f} px")
+        if models:
+            length, points = np.unique(np.diff(read_tracks(models[0]).offsets), return_counts=True)
+            print("    " + ", ".join(f"{count} in {images_each}" for images_each, count in zip(length, points)))
+        if models and ground_truth:
+            auc = score_model(models[0], read_strecha_cameras(ground_truth)).auc_percent
+            print(f"    AUC@0.5 deg {auc[0.5]:.1f}, AUC@1 deg {auc[1]:.1f}")
+
+
+if __name__ == "__main__":
+    compare_tracks(Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]) if len(sys.argv) > 3 else None)

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import json
 import logging
+import math
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -12,12 +13,13 @@ from typing import NoReturn
 
 from hm_sfm.atomic import replace_file
 from hm_sfm.config import Config, load_config
-from hm_sfm.errors import HmSfmError, InputError
+from hm_sfm.errors import HmSfmError, InputError, NoModelError
 
 EXAMPLES = """examples:
   hm-sfm demo out/demo                     render a small scene, reconstruct it, compare with the truth
   hm-sfm reconstruct photos out/castle     a folder of photos -> a COLMAP model in out/castle/sparse/0
   hm-sfm export photos out/castle          stop at out/castle/database.db, for COLMAP's GUI or mapper
+  hm-sfm compare photos out/tracks         its tracks beside those of LoFTR-style matches: out/tracks/compare.png
   hm-sfm reconstruct --help                all options of a command
 
 An interrupted or killed command goes on where it was when it is started again.
@@ -88,19 +90,31 @@ def make_parser() -> argparse.ArgumentParser:
     ):  # fmt: skip
         command = commands.add_parser(name, parents=[quiet], help=text, description=f"{text}. {more}")
         add_photo_options(command)
+        if name == "export":
+            text = "the database, or the files OUT/hloc/features.h5 and OUT/hloc/matches.h5 for hloc (default: colmap)"
+            command.add_argument("--format", choices=("colmap", "hloc"), default="colmap", help=text)
         command.set_defaults(run=run)
+
+    text = "photos -> models by persistent keypoints and by LoFTR-style matches, with their tracks compared"
+    more = "Leaves OUT/compare.json, OUT/compare.png and the models in OUT/METHOD/sparse/0."
+    command = commands.add_parser("compare", parents=[quiet], help=text, description=f"{text}. {more}")
+    add_photo_options(command)
+    add_compare_options(command)
 
     text = "render a small scene with known cameras, reconstruct it and print the error"
     command = commands.add_parser("demo", parents=[quiet], help=text, description=f"{text}. Needs no photos.")
     command.add_argument("out", metavar="OUT", type=Path, help="folder for the photos and the model")
     command.set_defaults(run=run_demo)
 
-    text = "measure the matches of single pairs against known poses or homographies"
+    text = "measure the matches of single pairs against known points, poses or homographies"
     command = commands.add_parser("evaluate", parents=[quiet], help=text, description=text)
     add_evaluate_options(command)
 
-    text = "train the network's fine stage on a folder of photos"
-    more = "The configuration names the photos, the output folder and the weights to start from."
+    text = "train the network on photos"
+    more = (
+        "The configuration names the stage, the photos, the output folder and the weights to start from. Several GPUs: "
+        "torchrun --nproc-per-node N -m hm_sfm.cli train ..."
+    )
     command = commands.add_parser("train", parents=[quiet], help=text, description=f"{text}. {more}")
     text = "YAML file, for example configs/train_light.yaml"
     command.add_argument("--config", type=Path, metavar="FILE", required=True, help=text)
@@ -110,15 +124,37 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def add_compare_options(command: argparse.ArgumentParser) -> None:
+    """The options of compare beside those of all commands that take photos."""
+    text = "folder of <image name>.camera files in Strecha's layout: adds the AUC of pose errors"
+    command.add_argument("--ground-truth", metavar="DIR", type=Path, help=text)
+    text = "weights of the LoFTR-style matches: bundled ones, or a file (default: light_expectation)"
+    command.add_argument("--expectation-model", metavar="NAME|FILE", default="light_expectation", help=text)
+    text = "a checkpoint of LoFTR: adds its own matches, through the package kornia"
+    command.add_argument("--loftr", metavar="FILE", type=Path, help=text)
+    text = "keypoints in hloc's format: adds hloc's result; needs --hloc-matches"
+    command.add_argument("--hloc-features", metavar="FILE", type=Path, help=text)
+    text = "matches in hloc's format, of the same pairs as all methods (--pairs FILE); needs --hloc-features"
+    command.add_argument("--hloc-matches", metavar="FILE", type=Path, help=text)
+    command.set_defaults(run=run_compare)
+
+
 def add_evaluate_options(command: argparse.ArgumentParser) -> None:
     """The options of evaluate."""
     text = (
-        "poses: a folder in Strecha's layout (images/, gt_dense_cameras/, K.txt), or a file in SuperGlue's "
-        "pairs_with_gt format; homographies: a folder in HPatches' layout"
+        "points: a folder of photos like those trained on, every 15th of which makes pairs with exact geometry; poses: "
+        "a folder in Strecha's layout (images/, gt_dense_cameras/, K.txt), or a file in SuperGlue's pairs_with_gt "
+        "format; homographies: a folder in HPatches' layout"
     )
-    command.add_argument("task", metavar="TASK", choices=("poses", "homographies"), help="poses or homographies")
+    tasks = ("points", "poses", "homographies")
+    command.add_argument("task", metavar="TASK", choices=tasks, help="points, poses or homographies")
     command.add_argument("data", metavar="DATA", type=Path, help=text)
     command.add_argument("--images", metavar="DIR", type=Path, help="folder of the images that a pairs file names")
+    text = "points: rendered scenes with parallax and occlusion, or warped photos (default: rendered)"
+    command.add_argument("--kind", choices=("rendered", "warped"), default="rendered", help=text)
+    command.add_argument("--count", metavar="N", type=int, default=50, help="points: how many pairs (default: 50)")
+    text = "draw the matches of each pair into this folder: green ones are right, red ones 5 px off or more"
+    command.add_argument("--pictures", metavar="DIR", type=Path, help=text)
     command.add_argument("--json", metavar="FILE", type=Path, help="write the figures to this file, too")
     for flag, key, metavar, text in PHOTO_OPTIONS:
         if key.startswith("matching."):
@@ -169,10 +205,44 @@ def run_match(options: argparse.Namespace) -> int:
 
 
 def run_export(options: argparse.Namespace) -> int:
-    from hm_sfm.reconstruction import export_database
+    from hm_sfm.reconstruction import export_database, export_hloc
 
-    matched = export_database(options.images, options.out, read_config(options), options.quiet)
-    print(f"{len(matched.images)} images and their keypoints: {options.out / 'database.db'}")
+    if options.format == "hloc":
+        matched = export_hloc(options.images, options.out, read_config(options), options.quiet)
+        files = f"{options.out / 'hloc' / 'features.h5'}, {options.out / 'hloc' / 'matches.h5'}"
+    else:
+        matched = export_database(options.images, options.out, read_config(options), options.quiet)
+        files = str(options.out / "database.db")
+    print(f"{len(matched.images)} images and their keypoints: {files}")
+    return 0
+
+
+def run_compare(options: argparse.Namespace) -> int:
+    from hm_sfm.comparison import compare
+    from hm_sfm.report import format_table, plot_tracks, require_plots, write_json
+
+    if (options.hloc_features is None) != (options.hloc_matches is None):
+        raise InputError("--hloc-features and --hloc-matches need each other: hloc keeps one run in two files")
+    require_plots()
+    comparison = compare(
+        options.images,
+        options.out,
+        read_config(options),
+        expectation_model=options.expectation_model,
+        ground_truth=options.ground_truth,
+        loftr=options.loftr,
+        hloc=(options.hloc_features, options.hloc_matches) if options.hloc_features else None,
+        quiet=options.quiet,
+    )
+    write_json(options.out / "compare.json", comparison)
+    plot_tracks(options.out / "compare.png", comparison)
+    print(format_table(comparison))
+    print(f"{options.out / 'compare.json'}, {options.out / 'compare.png'}; models: {options.out}/METHOD/sparse/0")
+    if not any(method.registered for method in comparison.methods):
+        raise NoModelError(
+            f"no method could build a model from {comparison.num_images} images; matches and databases are kept in "
+            f"{options.out}"
+        )
     return 0
 
 
@@ -202,33 +272,47 @@ def run_demo(options: argparse.Namespace) -> int:
 
 
 def run_evaluate(options: argparse.Namespace) -> int:
+    from hm_sfm.match_pictures import MatchPictures
     from hm_sfm.network.model import HomoMatcher
     from hm_sfm.pair_evaluation import read_strecha_pairs, read_superglue_pairs, score_homographies, score_poses
+    from hm_sfm.point_evaluation import score_points
+    from hm_sfm.training.photos import load_photos
+    from hm_sfm.training.validation import make_validation_pairs
 
     config = read_config(options)
     matcher = HomoMatcher.from_pretrained(
         config.matching.model, config=config.matching, images=config.images, network=config.network
     )
-    if options.task == "homographies":
-        scores = score_homographies(matcher, options.data, options.quiet)
-    elif options.data.is_file():
-        pairs = read_superglue_pairs(options.data, options.images or options.data.parent)
-        scores = score_poses(matcher, pairs, options.quiet)
+    pictures = MatchPictures(options.pictures) if options.pictures else None
+    if options.task == "points":
+        pairs = make_validation_pairs(load_photos(options.data), options.kind, options.count)
+        observe = pictures and pictures.draw_points
+        scores = score_points(matcher, pairs, config.verification.min_score, options.quiet, observe)
+    elif options.task == "homographies":
+        scores = score_homographies(matcher, options.data, options.quiet, pictures and pictures.draw_homography)
     else:
-        scores = score_poses(matcher, read_strecha_pairs(options.data), options.quiet)
+        if options.data.is_file():
+            pairs = read_superglue_pairs(options.data, options.images or options.data.parent)
+        else:
+            pairs = read_strecha_pairs(options.data)
+        scores = score_poses(matcher, pairs, options.quiet, pictures and pictures.draw_poses)
     for name, value in scores.items():
         print(f"{name:24} {value:9.2f}")
     if options.json:
+        # JSON has no NaN.
+        figures = {name: value if math.isfinite(value) else None for name, value in scores.items()}
         with replace_file(options.json) as temporary:
-            temporary.write_text(json.dumps(scores, indent=2) + "\n")
+            temporary.write_text(json.dumps(figures, indent=2) + "\n")
     return 0
 
 
 def run_train(options: argparse.Namespace) -> int:
     from hm_sfm.training.loop import TrainConfig, train
+    from hm_sfm.training.processes import find_processes
 
     weights = train(load_config(options.config, tuple(options.settings), TrainConfig), options.resume, options.quiet)
-    print(f"trained: {weights}")
+    if find_processes().is_first:
+        print(f"trained: {weights}")
     return 0
 
 

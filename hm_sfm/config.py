@@ -22,6 +22,8 @@ class NetworkConfig:
     """The architecture. A weights file carries its own; a configuration that disagrees is refused."""
 
     backbone: str = "light"
+    coarse: str = "cosine"
+    """`attention` (LoFTR's transformer and dual softmax) or `cosine` (mutual nearest neighbours of plain features)."""
     head: str = "homography"
     """`homography` (the paper) or `expectation` (LoFTR's point-to-patch baseline)."""
     window: int = 9
@@ -60,6 +62,9 @@ class MatchingConfig:
     """light: least cosine similarity of a coarse match."""
     max_matches: int = 8000
     """Best-scored matches kept per pair."""
+    grow_below: int = 300
+    """In pairs with fewer good matches, these spread to neighbours that the coarse stage missed; 0 is the paper. Where
+    there are enough, grown matches are no gain: they are less exact than those that the coarse stage finds itself."""
     feature_cache_mb: int = 1500
     device: str = "auto"
 
@@ -74,6 +79,10 @@ class VerificationConfig:
     """At the matching resolution; scaled to the photo."""
     min_inliers: int = 30
     min_inlier_ratio: float = 0.25
+    doubtful_inlier_ratio: float = 0.6
+    """What a pair with no more than min_inliers needs instead; it falls to min_inlier_ratio at sure_inliers. Chance
+    finds an epipolar line for a third of the matches of two different places."""
+    sure_inliers: int = 300
 
 
 @dataclass(frozen=True)

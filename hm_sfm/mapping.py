@@ -165,13 +165,20 @@ def verify_pairs(
             config.min_inliers,
             config.min_inlier_ratio,
         )
-        if agreeing.any():
+        if is_convincing(np.count_nonzero(agreeing), len(confident), config):
             inliers = np.zeros(len(matches), dtype=bool)
             inliers[confident[agreeing]] = True
             cover0 = measure_cover(matches.xy0[inliers], size_wh[pair.name0])
             cover1 = measure_cover(matches.xy1[inliers], size_wh[pair.name1])
             verified[pair] = VerifiedPair(pair, inliers, np.count_nonzero(inliers) * min(cover0, cover1))
     return verified
+
+
+def is_convincing(inliers: int, matches: int, config: VerificationConfig) -> bool:
+    """Whether so many inliers among so many matches prove that two photos show the same place."""
+    sureness = min(inliers / config.sure_inliers, 1.0)
+    ratio = config.doubtful_inlier_ratio + sureness * (config.min_inlier_ratio - config.doubtful_inlier_ratio)
+    return inliers > 0 and inliers >= ratio * matches
 
 
 def measure_cover(xy: np.ndarray, size_wh: tuple[int, int]) -> float:

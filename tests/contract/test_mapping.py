@@ -11,7 +11,15 @@ import pytest
 from hm_sfm.config import MappingConfig, VerificationConfig
 from hm_sfm.database import Cameras, open_database, write_database
 from hm_sfm.errors import InputError
-from hm_sfm.mapping import map_incrementally, summarise_models, verify_database, verify_pair, verify_pairs
+from hm_sfm.hloc import read_features, read_matches, write_features, write_matches
+from hm_sfm.mapping import (
+    is_convincing,
+    map_incrementally,
+    summarise_models,
+    verify_database,
+    verify_pair,
+    verify_pairs,
+)
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, PairMatches
 
 
@@ -341,3 +349,42 @@ def test_many_pairs_keep_those_that_agree_with_spread_inliers_as_the_strongest()
 
 def test_no_pairs_verify_to_nothing():
     assert verify_pairs([], [], None, {}, {}, VerificationConfig(), quiet=True) == {}
+
+
+# Through the files of hloc
+
+
+def test_oracle_matches_through_hlocs_files_give_the_oracles_model(tmp_path, oracle):
+    pairs = [found.pair for found in oracle.matches]
+    units = {image.name: 1.0 for image in oracle.images}
+    write_features(tmp_path / "features.h5", oracle.images, oracle.keypoints, units)
+    write_matches(tmp_path / "matches.h5", pairs, oracle.keypoints, oracle.matches)
+    keypoints = list(read_features(tmp_path / "features.h5", oracle.images))
+    matches = list(read_matches(tmp_path / "matches.h5", pairs, keypoints))
+    read = Oracle(oracle.model, oracle.images, keypoints, matches)
+    path = write_and_verify(tmp_path, read, make_known_camera(oracle))
+    (model,) = map_incrementally(path, tmp_path, tmp_path / "sparse", MappingConfig(), fix_intrinsics=True)
+    assert_same_up_to_similarity(model, oracle.model)
+    assert summarise_models([model], 6).mean_reprojection_px < 0.01
+
+
+def test_few_inliers_must_be_most_of_the_matches():
+    config = VerificationConfig(min_inliers=30, min_inlier_ratio=0.25, doubtful_inlier_ratio=0.6, sure_inliers=300)
+    assert is_convincing(300, 1200, config) and not is_convincing(299, 1200, config)
+    assert is_convincing(40, 60, config) and not is_convincing(40, 110, config)
+    assert is_convincing(150, 350, config) and not is_convincing(150, 360, config)
+    assert not is_convincing(0, 0, config)
+
+
+def test_a_pair_with_few_true_matches_among_wrong_ones_is_not_verified():
+    pair, camera, right = make_pair(120, 0.65, True)
+    cameras = dict.fromkeys((pair.pair.name0, pair.pair.name1), camera)
+    images = [ImageRef(name, Path(name), SIZE_WH) for name in cameras]
+
+    def verify(doubtful_inlier_ratio: float) -> dict:
+        config = VerificationConfig(doubtful_inlier_ratio=doubtful_inlier_ratio)
+        units = dict.fromkeys(cameras, 1.0)
+        return verify_pairs(images, [pair.pair], lambda _: pair, cameras, units, config, quiet=True)
+
+    assert 30 <= right.sum() <= 50
+    assert list(verify(0.25)) == [pair.pair] and not verify(0.6)

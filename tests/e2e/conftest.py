@@ -1,5 +1,6 @@
 """Scenes that are rendered and reconstructed once for all end-to-end tests, and ways to run the command."""
 
+import dataclasses
 import hashlib
 import shutil
 import subprocess
@@ -15,7 +16,7 @@ import pytest
 
 from hm_sfm.cli import main
 from hm_sfm.demo import write_demo
-from hm_sfm.network.model import HomoMatcher
+from hm_sfm.network.model import HomoMatcher, HomoNet, load_weights, save_weights
 from hm_sfm.types import PinholeView
 
 
@@ -91,6 +92,17 @@ def reconstructed(scene, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("reconstructed") / "out"
     assert main(["reconstruct", str(scene.images), str(out), "--quiet"]) == 0
     return out
+
+
+@pytest.fixture(scope="session")
+def expectation_weights(tmp_path_factory) -> Path:
+    """Weights of the expectation head on the features of the bundled `light` network; the head itself has none."""
+    light = load_weights("light")
+    net = HomoNet(dataclasses.replace(light.config, head="expectation"))
+    net.load_state_dict({key: value for key, value in light.state_dict().items() if not key.startswith("head.")})
+    path = tmp_path_factory.mktemp("expectation") / "expectation.pt"
+    save_weights(path, net)
+    return path
 
 
 @pytest.fixture

@@ -42,9 +42,7 @@ def test_two_quarter_turns_are_a_half_turn(width, height, x, y):
     np.testing.assert_allclose(twice, turn_points(xy, (width, height), 180), atol=1e-9)
 
 
-@given(
-    width=st.integers(1, 9), height=st.integers(1, 9), rotation=rotations, column=st.integers(0), row=st.integers(0)
-)
+@given(width=st.integers(1, 9), height=st.integers(1, 9), rotation=rotations, column=st.integers(0), row=st.integers(0))
 def test_points_turn_as_pixels_do(width, height, rotation, column, row):
     column, row = column % width, row % height
     impulse = np.zeros((height, width))

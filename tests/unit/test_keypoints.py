@@ -386,9 +386,7 @@ def test_matches_are_grouped_by_pair_in_the_order_of_names():
     # Image 0 is "z", image 1 is "a"; the link 0 -> 2 is told twice.
     photos = [make_photo("z"), make_photo("a")]
     image, index = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
-    (found,) = group_matches(
-        photos, image, index, np.array([0, 2, 1]), np.array([2, 0, 3]), np.array([0.5, 0.7, 0.2])
-    )
+    (found,) = group_matches(photos, image, index, np.array([0, 2, 1]), np.array([2, 0, 3]), np.array([0.5, 0.7, 0.2]))
     assert found.pair == ImagePair("a", "z")
     assert found.indices.tolist() == [[0, 0], [1, 1]]
     np.testing.assert_allclose(found.score, [0.7, 0.2])

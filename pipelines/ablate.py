@@ -1,0 +1,98 @@
+"""The paper's three ablations: what supervises the fine stage, its w/r/K, and the coarse transformer.
+
+    python pipelines/ablate.py configs/train_ablations.yaml --scene SCENE --attention-weights FILE
+
+Every variant of the fine stage starts from the same weights and is trained for the same few steps. FILE holds a trained
+coarse transformer: its network is judged with it, and without it by mutual nearest neighbours of the plain features;
+without FILE there is no third table. SCENE has the layout of Strecha's data sets: images/, gt_dense_cameras/ and K.txt.
+
+Variants lie in folders of their own below the configuration's `out`: an interrupted run goes on from there, and what is
+done is not done again. After a change of code, photos or scene, take a new `out`.
+"""
+
+import argparse
+import shlex
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from ablation_scores import Scores, Trial, describe_trial, drop_transformer, prepare_trial, score_once
+from tables import format_markdown
+
+from hm_sfm.atomic import replace_file
+from hm_sfm.config import load_config
+from hm_sfm.errors import ConfigError, HmSfmError
+from hm_sfm.network.model import digest_weights, load_weights
+from hm_sfm.training.loop import TrainConfig, train
+
+SUPERVISIONS = {"semi-dense": "centre", "+ dense": "dense", "+ suppressed": "suppressed"}
+"""Row -> TrainConfig.supervise."""
+SIZES = ((5, 1, 1), (9, 1, 1), (9, 1, 3), (9, 3, 1), (9, 3, 3))
+"""w, r, K."""
+POINTS = ("PCK@1", "PCK@3", "centre@1", "centre@3", "AUC@5")
+CELLS = ("recall", "precision", "real recall", "real precision")
+
+
+def ablate(config: TrainConfig, scene: Path, attention_weights: Path | None) -> str:
+    """The tables, as Markdown. Raises HmSfmError on unusable photos, scene or weights."""
+    trial = prepare_trial(config, scene)
+    coarse = score_coarse(attention_weights, trial) if attention_weights else {}
+    losses = {row: score_variant(replace(config, supervise=name), trial) for row, name in SUPERVISIONS.items()}
+    # LoFTR's head, trained as LoFTR does: a point has no homography to supervise.
+    expectation = replace(config, network=replace(config.network, head="expectation"), supervise="centre")
+    sizes = {"expectation": score_variant(expectation, trial)}
+    for w, r, k in SIZES:
+        network = replace(config.network, window=w, radius=r, iterations=k)
+        sizes[f"{w}/{r}/{k}"] = score_variant(replace(config, network=network), trial)
+    tables = {
+        "What supervises the fine stage": format_markdown(losses, POINTS),
+        "The size of the fine stage: w/r/K": format_markdown(sizes, (*POINTS, "fine ms")),
+        "The coarse transformer": format_markdown(coarse, (*CELLS, *POINTS, "coarse ms")) if coarse else "",
+    }
+    return "".join(f"\n## {title}\n\n{table}\n" for title, table in tables.items() if table)
+
+
+def score_variant(config: TrainConfig, trial: Trial) -> Scores:
+    """Train a variant of the fine stage, or what is left of it, and score it."""
+    net = config.network
+    name = f"{net.head}-{net.window}-{net.radius}-{net.iterations}-{config.supervise}"
+    config = replace(config, out=str(Path(config.out) / name))
+    print(name, file=sys.stderr)
+    stored = Path(config.out) / f"scores-{trial.key}.json"
+    return score_once(stored, trial, lambda: load_weights(str(train(config, resume=True))))
+
+
+def score_coarse(weights: Path, trial: Trial) -> dict[str, Scores]:
+    """A network with its coarse transformer and without it. Raises ConfigError where it has none."""
+    net = load_weights(str(weights))
+    if net.config.coarse != "attention":
+        raise ConfigError(f"{weights} has no coarse transformer: network.coarse is {net.config.coarse!r}")
+    folder = Path(trial.config.out) / f"coarse-{digest_weights(str(weights))[:8]}"
+    return {
+        "with": score_once(folder / f"with-{trial.key}.json", trial, lambda: net),
+        "without": score_once(folder / f"without-{trial.key}.json", trial, lambda: drop_transformer(net)),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("config", metavar="CONFIG", type=Path, help="what all trainings have in common")
+    parser.add_argument("--scene", type=Path, required=True, help="photos with known cameras")
+    parser.add_argument("--attention-weights", type=Path, metavar="FILE", help="adds the third table")
+    parser.add_argument("--steps", type=int, help="of each training (default: those of CONFIG)")
+    parser.add_argument("--report", type=Path, metavar="FILE", default=Path("docs/ablations.md"))
+    options = parser.parse_args()
+    try:
+        settings = () if options.steps is None else (f"steps={options.steps}",)
+        config = load_config(options.config, settings, TrainConfig)
+        tables = ablate(config, options.scene, options.attention_weights)
+    except HmSfmError as error:
+        parser.exit(error.exit_code, f"{parser.prog}: {error}\n")
+    print(tables)
+    options.report.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(options.report) as temporary:
+        temporary.write_text(describe_trial(config, options.scene, shlex.join(["python", *sys.argv])) + tables)
+
+
+if __name__ == "__main__":
+    main()

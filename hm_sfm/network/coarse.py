@@ -12,8 +12,10 @@ from torch import Tensor, nn
 
 from hm_sfm.network.transformer import CoarseTransformer, encode_positions, place_positions
 
-BLOCK_ROWS = 256
+BLOCK_ROWS = 64
 """Rows of the similarity matrix that are held at a time: so few stay in the processor's cache."""
+GROUP = 128
+"""Columns of it among which the largest entry is found at once."""
 LARGEST_SPREAD = 60.0
 """Logarithm of the range within which sums of exponentials share one scale in float32."""
 SHARPNESS = 10.0
@@ -103,7 +105,7 @@ def match_by_similarity(coarse0: Tensor, coarse1: Tensor, threshold: float, bloc
     at least `threshold`.
     """
     with torch.autocast(coarse0.device.type, enabled=False):
-        return pick_mutual((rows @ coarse1.T for rows in coarse0.split(block)), coarse1, threshold)
+        return pick_mutual(multiply_blocks(coarse0, coarse1, block), coarse1, threshold)
 
 
 def match_by_dual_softmax(
@@ -114,33 +116,52 @@ def match_by_dual_softmax(
     coarse0: (N0, C), coarse1: (N1, C) float32; sharpness: scalar, factor of their inner products. Two passes over
     blocks of rows: the first sums up rows and columns, the second compares; the whole matrix is never held.
     """
+    least = math.log(max(threshold, 1e-30))
     with torch.autocast(coarse0.device.type, enabled=False):
-        blocks = make_log_confidences(coarse0 * sharpness, coarse1, block)
-        index0, index1, log_confidence = pick_mutual(blocks, coarse1, math.log(max(threshold, 1e-30)))
-    return index0, index1, log_confidence.exp()
+        coarse0 = coarse0 * sharpness
+        row, column, top = sum_exponentials(coarse0, coarse1, block)
+        # A confidence is at most the softmax over the row: most rows of pairs with little overlap end here.
+        able = (top - row >= least - 1e-3).nonzero().flatten()
+        blocks = make_log_confidences(coarse0[able], coarse1, row[able], column, block)
+        index0, index1, log_confidence = pick_mutual(blocks, coarse1, least)
+    return able[index0], index1, log_confidence.exp()
 
 
-def make_log_confidences(coarse0: Tensor, coarse1: Tensor, block: int = BLOCK_ROWS) -> Iterator[Tensor]:
-    """Blocks of rows (n, N1) of the logarithms of the dual-softmax confidences of coarse0 @ coarse1.T."""
-    row, column = sum_exponentials(coarse0, coarse1, block)
+def make_log_confidences(
+    coarse0: Tensor, coarse1: Tensor, row: Tensor, column: Tensor, block: int = BLOCK_ROWS
+) -> Iterator[Tensor]:
+    """Blocks of rows (n, N1) of the logarithms of the dual-softmax confidences of coarse0 @ coarse1.T.
+
+    row (N0,), column (N1,): its sums, as sum_exponentials makes them.
+    """
     # 2 s - row - column, as one matrix product.
     rows = torch.cat([2 * coarse0, -row[:, None], -torch.ones_like(row)[:, None]], dim=1)
     columns = torch.cat([coarse1, torch.ones_like(column)[:, None], column[:, None]], dim=1)
-    for cells in rows.split(block):
-        yield cells @ columns.T
+    return multiply_blocks(rows, columns, block)
 
 
-def sum_exponentials(coarse0: Tensor, coarse1: Tensor, block: int) -> tuple[Tensor, Tensor]:
-    """The logarithms of the sums of exp(coarse0 @ coarse1.T) over each row, (N0,), and over each column, (N1,).
+def multiply_blocks(rows: Tensor, columns: Tensor, block: int) -> Iterator[Tensor]:
+    """Blocks of rows (n, N1) of rows @ columns.T, of (N0, C) and (N1, C), without gradient.
 
-    One exponential an entry serves both sums, relative to the largest entry of the block. That is exact unless a row
-    or column lies so far below it that it underflows; then the sums are made again, each relative to its own largest.
+    All lie in the same memory, so that the next one overwrites the last: fresh memory takes longer than the product.
     """
-    rows, top = [coarse0.new_zeros(0)], coarse0.new_tensor(-torch.inf)
+    memory = rows.new_empty(min(block, len(rows)), len(columns))
+    for cells in rows.split(block):
+        yield torch.mm(cells, columns.T, out=memory[: len(cells)])
+
+
+def sum_exponentials(coarse0: Tensor, coarse1: Tensor, block: int = BLOCK_ROWS) -> tuple[Tensor, Tensor, Tensor]:
+    """Sums of exp(coarse0 @ coarse1.T), as logarithms: over each row, (N0,), and over each column, (N1,).
+
+    The third is the largest entry of coarse0 @ coarse1.T in each row, (N0,). One exponential an entry serves both sums,
+    relative to the largest entry of the block. That is exact unless a row or column lies so far below it that it
+    underflows; then the sums are made again, each relative to its own largest.
+    """
+    rows, tops, top = [coarse0.new_zeros(0)], [coarse0.new_zeros(0)], coarse0.new_tensor(-torch.inf)
     column = coarse0.new_zeros(len(coarse1))
-    for cells in coarse0.split(block) if len(coarse0) and len(coarse1) else ():
-        similarity = cells @ coarse1.T
-        block_top = similarity.max()
+    for similarity in multiply_blocks(coarse0, coarse1, block) if len(coarse0) and len(coarse1) else ():
+        tops.append(similarity.amax(dim=1))
+        block_top = tops[-1].max()
         power = similarity.sub_(block_top).exp_()
         rows.append(power.sum(dim=1).log_() + block_top)
         higher = torch.maximum(top, block_top)
@@ -149,14 +170,28 @@ def sum_exponentials(coarse0: Tensor, coarse1: Tensor, block: int) -> tuple[Tens
     row, column = torch.cat(rows), column.log() + top
     lowest = min((sums.min().item() for sums in (row, column) if len(sums)), default=0.0)
     if top - lowest < LARGEST_SPREAD:
-        return row, column
+        return row, column, torch.cat(tops)
     column = coarse0.new_full((len(coarse1),), -torch.inf)
     rows = []
-    for cells in coarse0.split(block):
-        similarity = cells @ coarse1.T
+    for similarity in multiply_blocks(coarse0, coarse1, block):
         rows.append(similarity.logsumexp(dim=1))
         column = torch.logaddexp(column, similarity.logsumexp(dim=0))
-    return torch.cat(rows), column
+    return torch.cat(rows), column, torch.cat(tops)
+
+
+def find_largest(scores: Tensor) -> tuple[Tensor, Tensor]:
+    """The largest entry of each row of (N, K), K > 0, and its column, (N,) each.
+
+    Largest of groups of columns first: torch.argmax over whole rows takes ten times as long on a CPU.
+    """
+    count = scores.shape[1]
+    whole = count // GROUP * GROUP
+    tops = [scores[:, :whole].unflatten(1, (-1, GROUP)).amax(dim=2)] if whole else []
+    tops += [scores[:, whole:].amax(dim=1, keepdim=True)] if whole < count else []
+    best, group = torch.cat(tops, dim=1).max(dim=1)
+    columns = (group[:, None] * GROUP + torch.arange(GROUP, device=scores.device)).clamp_max_(count - 1)
+    within = scores.gather(1, columns).argmax(dim=1, keepdim=True)
+    return best, columns.gather(1, within)[:, 0]
 
 
 def pick_mutual(blocks: Iterable[Tensor], coarse1: Tensor, threshold: float) -> Matches:
@@ -168,15 +203,12 @@ def pick_mutual(blocks: Iterable[Tensor], coarse1: Tensor, threshold: float) -> 
     candidates, arguments, bests = [none], [none], [coarse1.new_zeros(0)]
     best_of_column = coarse1.new_full((len(coarse1),), -torch.inf)
     first_row = 0
-    for scores in blocks if len(coarse1) else ():
-        best = scores.amax(dim=1)
-        # An entry that could outdo another in its column has a row whose best is good enough, too.
+    for scores in filter(len, blocks) if len(coarse1) else ():
+        best, argument = find_largest(scores)
+        torch.maximum(best_of_column, scores.amax(dim=0), out=best_of_column)
         good = (best >= threshold).nonzero().flatten()
-        if len(good):
-            rows = scores[good]
-            arguments.append(rows.argmax(dim=1))
-            torch.maximum(best_of_column, rows.amax(dim=0), out=best_of_column)
         candidates.append(good + first_row)
+        arguments.append(argument[good])
         bests.append(best[good])
         first_row += len(scores)
     index0, index1, best = torch.cat(candidates), torch.cat(arguments), torch.cat(bests)

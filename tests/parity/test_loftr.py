@@ -8,7 +8,7 @@ from kornia.feature import LoFTR
 
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, load_config
 from hm_sfm.errors import WeightsError
-from hm_sfm.network.coarse import SHARPNESS, make_log_confidences, match_by_dual_softmax
+from hm_sfm.network.coarse import SHARPNESS, make_log_confidences, match_by_dual_softmax, sum_exponentials
 from hm_sfm.network.model import HomoMatcher, HomoNet, load_weights
 from hm_sfm.network.transformer import attend_linearly
 
@@ -51,7 +51,9 @@ def test_coarse_confidences_equal_kornias(kornia_net, checkpoint, size_hw):
         net.coarse.describe(net.backbone(image).coarse).flatten(2).transpose(1, 2) for image in (image0, image1)
     ]
     aware0, aware1 = net.coarse(*described)
-    ours = torch.cat(list(make_log_confidences(aware0[0] * SHARPNESS / 256, aware1[0], block=50))).exp()
+    scaled0 = aware0[0] * SHARPNESS / 256
+    row, column, _ = sum_exponentials(scaled0, aware1[0], block=50)
+    ours = torch.cat([cells.exp() for cells in make_log_confidences(scaled0, aware1[0], row, column, block=50)])
     assert torch.allclose(ours, data["conf_matrix"][0], atol=1e-4)
     assert ours.max() > 10 * ours.mean()
 

@@ -5,8 +5,10 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
+from hypothesis import given
+from hypothesis import strategies as st
 
-from hm_sfm.network.coarse import AttentionCoarse, match_by_dual_softmax
+from hm_sfm.network.coarse import AttentionCoarse, find_largest, match_by_dual_softmax
 from hm_sfm.network.transformer import CoarseTransformer, place_positions
 from hm_sfm.training.losses import measure_coarse_loss
 from hm_sfm.training.supervision import CoarseSupervision
@@ -140,3 +142,11 @@ def test_it_learns_which_of_two_equal_windows_is_meant(generator, one_thread):
         index0, index1, confidence = coarse.match(cells[0], cells[0], 0.2)
     assert index0.tolist() == index1.tolist() == every.tolist()
     assert confidence.min() > 0.8
+
+
+@given(st.integers(1, 5), st.integers(1, 300), st.integers(0, 2**32 - 1))
+def test_the_largest_entry_of_a_row_and_its_place(rows, columns, seed):
+    scores = torch.randn(rows, columns, generator=torch.Generator().manual_seed(seed))
+    best, place = find_largest(scores)
+    assert torch.equal(best, scores.amax(dim=1))
+    assert torch.equal(place, scores.argmax(dim=1))

@@ -8,7 +8,6 @@ import numpy as np
 
 PRIOR_WEIGHT = 0.01
 """Of each keypoint's first position, relative to one prediction: holds a track where its predictions leave it free."""
-ROUNDS = 15
 STEP = 0.6
 FULL_TRUST_PX = 0.25
 """Expected error of a prediction at which its weight is a half; 1 is the weight of an exact one."""
@@ -27,9 +26,9 @@ def weigh_scores(score: np.ndarray) -> np.ndarray:
 
 def adjust_keypoints(
     xy: np.ndarray, source: np.ndarray, target: np.ndarray, predicted: np.ndarray, jacobian: np.ndarray,
-    weight: np.ndarray,
+    weight: np.ndarray, rounds: int,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Move keypoints to agree with their links.
+    """Move keypoints to agree with their links, in so many rounds.
 
     xy: (K, 2) positions; link e says that keypoint target[e] lies at predicted[e] + jacobian[e] (x - xy[source[e]])
     when its source lies at x: source, target (E,) int64, predicted (E, 2), jacobian (E, 2, 2), weight (E,).
@@ -43,13 +42,16 @@ def adjust_keypoints(
     count = len(xy)
     ends = np.concatenate([target, source])
     links_at = np.bincount(ends, minlength=count)
-    for _ in range(ROUNDS):
+    for number in range(rounds + 1):
         forward = predict_targets(xy, moved, source, predicted, jacobian)
-        backward = xy[source] + np.einsum("eij,ej->ei", inverse, moved[target] - predicted)
         residual = np.linalg.norm(forward - moved[target], axis=1)
         robust = weight / (1 + (residual / ROBUST_SCALE) ** 2)
-        says, trust = np.concatenate([forward, backward]), np.concatenate([robust, robust])
+        trust = np.tile(robust, 2)
         total = np.bincount(ends, trust, count) + PRIOR_WEIGHT
+        if number == rounds:
+            break
+        backward = xy[source] + np.einsum("eij,ej->ei", inverse, moved[target] - predicted)
+        says = np.concatenate([forward, backward])
         for axis in range(2):
             mean = (np.bincount(ends, trust * says[:, axis], count) + PRIOR_WEIGHT * xy[:, axis]) / total
             # Less than a full step: two linked keypoints that both move to the other's wish would swap for ever.

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
@@ -11,13 +11,26 @@ def replace_file(path: Path) -> Iterator[Path]:
     """Give a temporary path beside `path` to write to; it takes the place of `path` when the block ends well.
 
     A block that fails leaves `path` as it was and no temporary file; a killed process may leave `path`.tmp, which the
-    next writer overwrites.
+    next writer overwrites. When the block has ended, the file outlasts a power failure.
     """
     path = Path(path)
     temporary = path.with_name(path.name + ".tmp")
     try:
         yield temporary
+        # A rename can reach the disk before the content does.
+        _flush(temporary, os.O_RDWR)
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+    with suppress(OSError):  # not all file systems let a folder be flushed
+        _flush(path.parent, os.O_RDONLY)
+
+
+def _flush(path: Path, flags: int) -> None:
+    """Make the disk hold what was written to a file, or which names stand in a folder."""
+    descriptor = os.open(path, flags)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -26,9 +26,10 @@ An interrupted or killed command goes on where it was when it is started again.
 exit codes: 0 done, 2 bad arguments or input, 3 no model could be built, 130 interrupted"""
 
 PHOTO_OPTIONS = (
-    ("--pairs", "pairs.mode", "auto|exhaustive|sequential|FILE",
-     "which images to match: all with all; neighbours in the order of their names; those of a file with two names a "
-     "line; or auto, all up to 60 images and a selection beyond"),
+    ("--pairs", "pairs.mode", "auto|exhaustive|sequential|retrieval|spatial|FILE",
+     "which images to match: all with all; neighbours in the order of their names; those that look alike; those taken "
+     "near each other by GPS; those of a file with two names a line; or auto, all up to 60 images and a selection "
+     "beyond"),
     ("--model", "matching.model", "light|FILE", "the network's weights: bundled ones, or a file made by hm-sfm train"),
     ("--device", "matching.device", "auto|cpu|cuda", "where the network runs; auto takes the GPU if there is one"),
     ("--camera-mode", "cameras.mode", "auto|single|per-folder|per-image",
@@ -37,6 +38,15 @@ PHOTO_OPTIONS = (
     ("--camera-params", "cameras.params", "F,...",
      "known intrinsics in px, in the order of the camera model (PINHOLE: fx,fy,cx,cy), which are then kept as they "
      "are; otherwise the focal length starts from EXIF and is refined"),
+    ("--cameras", "cameras.file", "MODEL",
+     "a COLMAP model, or its cameras.txt beside its images.txt: the intrinsics of all photos, which are then kept"),
+    ("--poses", "cameras.poses", "MODEL",
+     "as --cameras, and the poses are kept, too: points are triangulated, nothing else is estimated"),
+    ("--masks", "masks.folder", "DIR",
+     "do not match what is black in the masks of this folder: that of a/b.jpg is a/b.jpg.png, of the same size"),
+    ("--camera-mask", "masks.camera", "FILE", "do not match what is black in this mask, in all photos of its size"),
+    ("--mapper", "mapping.mapper", "incremental|global",
+     "COLMAP's incremental mapper, image by image, or its global one, all at once"),
 )  # fmt: skip
 """Flag, key of the configuration, what it takes, help."""
 
@@ -82,7 +92,7 @@ def make_parser() -> argparse.ArgumentParser:
 
     for name, run, text, more in (
         ("reconstruct", run_reconstruct, "photos -> a COLMAP model in OUT/sparse/0",
-         "Also leaves OUT/pairs.txt, OUT/matches.h5, OUT/database.db and OUT/summary.json."),
+         "Also leaves OUT/pairs.txt, OUT/matches.h5, OUT/database.db, OUT/summary.json and OUT/report.html."),
         ("match", run_match, "photos -> pairs and matches only, OUT/pairs.txt and OUT/matches.h5",
          "reconstruct or export with the same OUT goes on from there."),
         ("export", run_export, "photos -> OUT/database.db, verified, for COLMAP's GUI or mapper",
@@ -90,16 +100,43 @@ def make_parser() -> argparse.ArgumentParser:
     ):  # fmt: skip
         command = commands.add_parser(name, parents=[quiet], help=text, description=f"{text}. {more}")
         add_photo_options(command)
+        text = "match in this process, or by the workers of a Ray cluster (default: serial)"
+        command.add_argument("--engine", dest="matching.engine", metavar="serial|ray", help=text)
+        if name == "match":
+            text = "match only part I of N of the pairs, for example 2/8; hm-sfm merge gathers the parts"
+            command.add_argument("--shard", metavar="I/N", help=text)
         if name == "export":
             text = "the database, or the files OUT/hloc/features.h5 and OUT/hloc/matches.h5 for hloc (default: colmap)"
             command.add_argument("--format", choices=("colmap", "hloc"), default="colmap", help=text)
         command.set_defaults(run=run)
+
+    text = "gather what hm-sfm match --shard made in OUT/matches.h5"
+    more = "Takes the options that the shards were matched with. reconstruct or export with the same OUT goes on."
+    command = commands.add_parser("merge", parents=[quiet], help=text, description=f"{text}. {more}")
+    command.add_argument("images", metavar="IMAGES", type=Path, help="the folder of photos that was matched")
+    command.add_argument("out", metavar="OUT", type=Path, help="the folder that all shards were made in")
+    add_matching_options(command)
+    command.set_defaults(run=run_merge)
 
     text = "photos -> models by persistent keypoints and by LoFTR-style matches, with their tracks compared"
     more = "Leaves OUT/compare.json, OUT/compare.png and the models in OUT/METHOD/sparse/0."
     command = commands.add_parser("compare", parents=[quiet], help=text, description=f"{text}. {more}")
     add_photo_options(command)
     add_compare_options(command)
+
+    text = "match two photos and draw their matches, and the second warped into the first"
+    more = "Nothing else is written. The line that is printed says whether reconstruct would use the pair."
+    command = commands.add_parser("show", parents=[quiet], help=text, description=f"{text}. {more}")
+    command.add_argument("photo_a", metavar="A", type=Path, help="a photo")
+    command.add_argument("photo_b", metavar="B", type=Path, help="another photo")
+    command.add_argument("picture", metavar="PICTURE", type=Path, help="file to write: .jpg, .png or .webp")
+    add_matching_options(command)
+    command.set_defaults(run=run_show)
+
+    text = "the model of a run -> the files of other programs"
+    more = "Takes the largest model, OUT/sparse/0; for hloc the keypoints and matches of OUT/database.db."
+    command = commands.add_parser("convert", parents=[quiet], help=text, description=f"{text}. {more}")
+    add_convert_options(command)
 
     text = "render a small scene with known cameras, reconstruct it and print the error"
     command = commands.add_parser("demo", parents=[quiet], help=text, description=f"{text}. Needs no photos.")
@@ -122,6 +159,21 @@ def make_parser() -> argparse.ArgumentParser:
     add_settings(command, "steps=1000")
     command.set_defaults(run=run_train)
     return parser
+
+
+def add_convert_options(command: argparse.ArgumentParser) -> None:
+    """The options of convert."""
+    command.add_argument("out", metavar="OUT", type=Path, help="folder of an earlier run")
+    text = (
+        "hloc: features.h5 and matches.h5; nerfstudio: undistorted images, transforms.json and points; 3dgs: "
+        "undistorted images and their model, for Gaussian splatting; ply: the points; txt: COLMAP's text files"
+    )
+    formats = ("hloc", "nerfstudio", "3dgs", "ply", "txt")
+    command.add_argument("--to", choices=formats, required=True, help=text)
+    command.add_argument("target", metavar="DEST", type=Path, help="a new folder; for ply, a new file")
+    text = "folder of the photos, if it is no longer where it was in the run"
+    command.add_argument("--images", metavar="DIR", type=Path, help=text)
+    command.set_defaults(run=run_convert)
 
 
 def add_compare_options(command: argparse.ArgumentParser) -> None:
@@ -156,12 +208,17 @@ def add_evaluate_options(command: argparse.ArgumentParser) -> None:
     text = "draw the matches of each pair into this folder: green ones are right, red ones 5 px off or more"
     command.add_argument("--pictures", metavar="DIR", type=Path, help=text)
     command.add_argument("--json", metavar="FILE", type=Path, help="write the figures to this file, too")
+    add_matching_options(command)
+    command.set_defaults(run=run_evaluate)
+
+
+def add_matching_options(command: argparse.ArgumentParser) -> None:
+    """The options of commands that need the settings of the matcher only."""
     for flag, key, metavar, text in PHOTO_OPTIONS:
         if key.startswith("matching."):
             command.add_argument(flag, dest=key, metavar=metavar, help=text)
     command.add_argument("--config", type=Path, metavar="FILE", help="YAML file of settings like configs/light.yaml")
     add_settings(command, "matching.coarse_threshold=0.7")
-    command.set_defaults(run=run_evaluate)
 
 
 def add_photo_options(command: argparse.ArgumentParser) -> None:
@@ -198,9 +255,20 @@ def read_config(options: argparse.Namespace) -> Config:
 
 def run_match(options: argparse.Namespace) -> int:
     from hm_sfm.reconstruction import match_photos
+    from hm_sfm.shards import Shard
 
-    matched = match_photos(options.images, options.out, read_config(options), options.quiet)
-    print(f"{len(matched.pairs)} pairs of {len(matched.images)} images matched: {options.out / 'matches.h5'}")
+    shard = None if options.shard is None else Shard.parse(options.shard)
+    matched = match_photos(options.images, options.out, read_config(options), options.quiet, shard)
+    matches = shard.locate(options.out) if shard else options.out / "matches.h5"
+    print(f"{len(matched.pairs)} pairs of {len(matched.images)} images matched: {matches}")
+    return 0
+
+
+def run_merge(options: argparse.Namespace) -> int:
+    from hm_sfm.reconstruction import merge_matches
+
+    count = merge_matches(options.images, options.out, read_config(options))
+    print(f"{count} pairs: {options.out / 'matches.h5'}")
     return 0
 
 
@@ -254,6 +322,14 @@ def run_reconstruct(options: argparse.Namespace) -> int:
     return 0
 
 
+def run_convert(options: argparse.Namespace) -> int:
+    from hm_sfm.conversion import convert_run
+
+    convert_run(options.out, options.to, options.target, options.images)
+    print(f"{options.to}: {options.target}")
+    return 0
+
+
 def run_demo(options: argparse.Namespace) -> int:
     from hm_sfm.demo import write_demo
     from hm_sfm.evaluation import read_strecha_cameras, score_model
@@ -268,6 +344,25 @@ def run_demo(options: argparse.Namespace) -> int:
         f"against the truth: AUC@1 deg {score.auc_percent[1]:.1f}, AUC@3 deg {score.auc_percent[3]:.1f}, "
         f"median rotation error {score.median_rotation_deg:.3f} deg, translation {score.median_translation_deg:.3f} deg"
     )
+    return 0
+
+
+def run_show(options: argparse.Namespace) -> int:
+    from hm_sfm.network.model import HomoMatcher
+    from hm_sfm.pair_picture import check_picture_path, draw_pair, write_picture
+
+    check_picture_path(options.picture)
+    config = read_config(options)
+    matcher = HomoMatcher.from_pretrained(
+        config.matching.model, config=config.matching, images=config.images, network=config.network
+    )
+    shown = draw_pair(matcher, options.photo_a, options.photo_b, config.verification)
+    write_picture(options.picture, shown.picture)
+    print(
+        f"{options.photo_a.name}, {options.photo_b.name}: {shown.matches} matches, {shown.good} of them good, "
+        f"{shown.agreeing} agree with one geometry: {'verified' if shown.is_verified else 'not verified'}"
+    )
+    print(f"picture: {options.picture}")
     return 0
 
 
@@ -324,7 +419,7 @@ def print_summary(out: Path) -> None:
         f"mean track length {summary['mean_track_length']:.2f} images, "
         f"mean reprojection error {summary['mean_reprojection_px']:.3f} px"
     )
-    print(f"model: {out / 'sparse' / '0'} ({summary['seconds']['total']:.0f} s)")
+    print(f"model: {out / 'sparse' / '0'} ({summary['seconds']['total']:.0f} s), report: {out / 'report.html'}")
 
 
 if __name__ == "__main__":

@@ -25,16 +25,19 @@ from hm_sfm.errors import ConfigError, InputError, NoModelError
 from hm_sfm.evaluation import read_strecha_cameras, score_model
 from hm_sfm.hloc import read_features, read_matches
 from hm_sfm.images import list_images
+from hm_sfm.locks import release_locks
 from hm_sfm.loftr import LoftrMatcher
 from hm_sfm.loftr_style import make_keypoints
-from hm_sfm.mapping import map_incrementally, summarise_models, verify_database
+from hm_sfm.mapping import choose_mapper, map_images, summarise_models
+from hm_sfm.masks import NO_MASKS, MaskedStore, Masks, read_masks
 from hm_sfm.matching import match_pairs
 from hm_sfm.network.model import HomoMatcher
-from hm_sfm.pairs import select_pairs, write_pairs
-from hm_sfm.reconstruction import claim_folder, describe_matching, measure_units, reconstruct, stopwatch
+from hm_sfm.pairs import write_pairs
+from hm_sfm.reconstruction import choose_pairs, claim_folder, describe_matching, measure_units, reconstruct, stopwatch
 from hm_sfm.store import MatchStore, digest_image
-from hm_sfm.tracks import build_tracks, label_tracks
+from hm_sfm.tracks import build_tracks, label_tracks, read_tracks
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, PinholeView, Tracks
+from hm_sfm.verification import verify_database
 
 CELLS_PX = (1, 2, 4, 8)
 """Cells that LoFTR-style matches are snapped to."""
@@ -99,6 +102,7 @@ class Run:
     digests: dict[str, str]
     """Image name -> digest of the photo."""
     truth: dict[str, PinholeView] | None
+    masks: Masks = NO_MASKS
 
 
 @dataclass(frozen=True)
@@ -121,6 +125,7 @@ class Method:
     """Leaves the database and the models, if any, in OUT/name; returns the seconds of each stage."""
 
 
+@release_locks()
 def compare(
     image_folder: Path,
     out: Path,
@@ -149,8 +154,10 @@ def compare(
     """
     listed = list_images(image_folder)
     names = [image.name for image in listed.images]
-    pairs = select_pairs(names, config.pairs)
+    pairs = choose_pairs(listed.images, out, config, quiet)
     cameras = make_cameras(listed.images, config.cameras)
+    masks = read_masks(listed.images, config.masks)
+    choose_mapper(config.mapping)
     truth = read_truth(ground_truth, names) if ground_truth else None
     matchers = {"persistent": (load_matcher(config), describe_matching(config))}
     matchers["loftr_style"] = load_expectation(expectation_model, config)
@@ -160,7 +167,7 @@ def compare(
 
     out = Path(out)
     digests = {image.name: digest_image(image) for image in listed.images}
-    run = Run(Path(image_folder), out, config, quiet, listed.images, pairs, cameras, digests, truth)
+    run = Run(Path(image_folder), out, config, quiet, listed.images, pairs, cameras, digests, truth, masks)
     imported = import_hloc(run, *hloc) if hloc else None
     claim_folder(out)
     write_pairs(out / "pairs.txt", pairs)
@@ -241,9 +248,8 @@ def plan_loftr_style(run: Run, matching: Matching) -> list[Method]:
             seconds: dict[str, float | None] = {"match": complete_matches(run, matching)}
             with stopwatch(seconds, "keypoints"):
                 px_per_unit = measure_units(run.images, run.config)
-                keypoints, matches = make_keypoints(
-                    run.images, run.pairs, matching.store.read, px_per_unit, cell_px, budget
-                )
+                read = MaskedStore(matching.store, run.masks).read
+                keypoints, matches = make_keypoints(run.images, run.pairs, read, px_per_unit, cell_px, budget)
             return map_keypoints(run, name, keypoints, matches, seconds)
 
         return Method(name, [matching.store.made_by, budget], build)
@@ -312,12 +318,13 @@ def map_keypoints(
         stopwatch(seconds, "map"),
         tqdm(total=len(run.images), desc=f"mapping {name}", unit="image", disable=run.quiet) as progress,
     ):
-        map_incrementally(
+        map_images(
             database,
             run.image_folder,
             database.with_name("sparse"),
+            run.images,
+            run.cameras,
             run.config.mapping,
-            fix_intrinsics=bool(run.config.cameras.params),
             on_image=progress.update,
         )
     return seconds
@@ -330,7 +337,10 @@ def finish_method(run: Run, method: Method) -> MethodResult:
     """
     folder = run.out / method.name
     config = run.config
-    shared = [version("hm_sfm"), run.digests, list(map(str, run.pairs))]
+    shared = [version("hm_sfm"), run.digests, list(map(str, run.pairs)), run.masks.digest()]
+    # What files that the configuration only names have said.
+    shared += [[camera.params.tolist() for camera in run.cameras.cameras], run.cameras.camera_index]
+    shared += [[pose.matrix().tolist() for pose in run.cameras.cam_from_world]]
     made_by = fingerprint(*shared, config.cameras, config.verification, config.mapping, method.made_by)
     finished = read_finished(folder, made_by)
     if finished is None:
@@ -411,18 +421,3 @@ def read_matched_tracks(database_path: Path) -> Tracks:
     keypoint = np.arange(len(image)) - np.repeat(np.cumsum(counts) - counts, counts)
     label = label_tracks(len(image), source, target, np.ones(len(source)), image)
     return build_tracks(label, image, keypoint)
-
-
-def read_tracks(model: pycolmap.Reconstruction) -> Tracks:
-    """The tracks of a model's points, in the order of their ids; images are numbered in the order of their ids.
-
-    Where an image observes a point twice, the first observation counts.
-    """
-    rows = [np.zeros((3, 0), np.int64)]
-    for number, image_id in enumerate(sorted(model.reg_image_ids())):
-        image = model.image(image_id)
-        point = np.array([seen.point3D_id for seen in image.get_observation_points2D()], np.int64)
-        keypoint = np.array(image.get_observation_point2D_idxs(), np.int64)
-        point, first = np.unique(point, return_index=True)
-        rows.append(np.stack([point, np.full(len(point), number), keypoint[first]]))
-    return build_tracks(*np.concatenate(rows, axis=1))

@@ -43,15 +43,31 @@ class ImageConfig:
 
 
 @dataclass(frozen=True)
+class MaskConfig:
+    """Black pixels of masks are not matched."""
+
+    folder: str = ""
+    """Holds the mask of a/b.jpg as a/b.jpg.png, of the same size."""
+    camera: str = ""
+    """A mask of all images of its size."""
+
+
+@dataclass(frozen=True)
 class PairConfig:
     mode: str = "auto"
-    """auto | exhaustive | sequential | a pairs file."""
+    """auto | exhaustive | sequential | retrieval | spatial | a pairs file."""
     exhaustive_limit: int = 60
-    """auto matches all pairs up to this many images."""
+    """auto matches all pairs up to this many images; of more, those of retrieval, spatial and a sequence's window."""
     window: int = 5
     """sequential: each image with so many followers, and with those at distances of powers of two."""
-    spread: int = 10
-    """auto beyond the limit: evenly spread partners added to each image's sequential ones."""
+    loop_top: int = 0
+    """sequential: and with so many that look most like it far from it in the sequence."""
+    retrieval_top: int = 20
+    """retrieval: each image with so many that look most like it."""
+    spatial_top: int = 20
+    """spatial: each image with so many that were taken nearest to it, by the positions in EXIF,"""
+    spatial_distance_m: float = 100.0
+    """and none farther away than this."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +82,10 @@ class MatchingConfig:
     """In pairs with fewer good matches, these spread to neighbours that the coarse stage missed; 0 is the paper. Where
     there are enough, grown matches are no gain: they are less exact than those that the coarse stage finds itself."""
     feature_cache_mb: int = 1500
+    """Per process that matches: two photos at least."""
     device: str = "auto"
+    engine: str = "serial"
+    """serial, or ray: by the workers of a Ray cluster."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +114,8 @@ class KeypointConfig:
     separation_px: float = 2.0
     seed_spacing_px: float = 5.0
     """A patch seeds a keypoint where none is nearer than this."""
+    adjustment_rounds: int = 15
+    """Of the joint adjustment of each track's keypoints; 0 leaves them where they were first predicted."""
     max_keypoints: int = 8000
     """Per image, longest tracks first, spread over the image."""
 
@@ -106,10 +127,16 @@ class CameraConfig:
     model: str = "SIMPLE_RADIAL"
     params: str = ""
     """Known intrinsics, `f,...` in the order of COLMAP's camera model; they stay fixed."""
+    file: str = ""
+    """A COLMAP model, or its cameras.txt or cameras.bin, with the known intrinsics of each image; they stay fixed."""
+    poses: str = ""
+    """As `file`, and the poses are known, too: points are triangulated, nothing is mapped."""
 
 
 @dataclass(frozen=True)
 class MappingConfig:
+    mapper: str = "incremental"
+    """incremental | global."""
     min_model_size: int = 2
     seed: int = 0
 
@@ -118,6 +145,7 @@ class MappingConfig:
 class Config:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     images: ImageConfig = field(default_factory=ImageConfig)
+    masks: MaskConfig = field(default_factory=MaskConfig)
     pairs: PairConfig = field(default_factory=PairConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     verification: VerificationConfig = field(default_factory=VerificationConfig)

@@ -1,4 +1,7 @@
-"""The COLMAP database: cameras from EXIF or from the user, then images, keypoints and matches, through pycolmap."""
+"""The COLMAP database: cameras from EXIF or from the user, then images with positions from EXIF, keypoints and matches.
+
+All of it through pycolmap.
+"""
 
 import difflib
 import math
@@ -7,11 +10,13 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+import numpy as np
 import pycolmap
 
+from hm_sfm.colmap_models import find_known
 from hm_sfm.config import CameraConfig
 from hm_sfm.errors import ConfigError, InputError
-from hm_sfm.types import ImageRef, IndexMatches, Keypoints
+from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 # COLMAP's guess of a focal length that nothing is known about, relative to the longer side.
 DEFAULT_FOCAL_RATIO = 1.2
@@ -28,6 +33,10 @@ class Cameras:
     """camera_id is the position + 1. has_prior_focal_length is set where EXIF or the user gave the focal length."""
     camera_index: tuple[int, ...]
     """Per image, in the order of the images: index into `cameras`."""
+    known: bool = False
+    """Whether the intrinsics are known and stay as they are."""
+    cam_from_world: tuple[pycolmap.Rigid3d, ...] = ()
+    """Per image, in the order of the images; empty where the poses are not known."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +53,16 @@ def make_cameras(images: Sequence[ImageRef], config: CameraConfig) -> Cameras:
     Modes: `single`, `per-folder` and `per-image` say it all. `auto` takes one camera where all images agree in size
     and EXIF lens (or have none), and otherwise one per folder, size and lens. The focal length comes from EXIF, or is
     COLMAP's default, to be refined. `config.params` are known intrinsics for every camera; EXIF is then not read.
+    `config.file` and `config.poses` name a COLMAP model that has them; it also says which images share a camera.
 
-    Raises ConfigError on an unknown mode or model or on unusable params, InputError where images that have to share a
-    camera differ in size and where an image cannot be read.
+    Raises ConfigError on an unknown mode or model, on unusable params and where intrinsics are given twice, InputError
+    where images that have to share a camera differ in size, where an image cannot be read, and what find_known raises.
     """
+    given = [name for name in ("params", "file", "poses") if getattr(config, name)]
+    if len(given) > 1:
+        raise ConfigError(f"cameras.{given[0]} and cameras.{given[1]} both give the intrinsics: leave one of them out")
+    if config.file or config.poses:
+        return _take_cameras(images, config)
     model = _parse_model(config.model)
     params = _parse_params(config.params, model)
     exif = [_ExifFocal(None, None) if params else _read_exif_focal(image) for image in images]
@@ -78,7 +93,19 @@ def make_cameras(images: Sequence[ImageRef], config: CameraConfig) -> Cameras:
                     f"the principal point within {_size(first)}"
                 )
         cameras.append(camera)
-    return Cameras(tuple(cameras), tuple(camera_index))
+    return Cameras(tuple(cameras), tuple(camera_index), known=bool(params))
+
+
+def _take_cameras(images: Sequence[ImageRef], config: CameraConfig) -> Cameras:
+    """The cameras of a COLMAP model, and its poses where these are asked for."""
+    known, poses = find_known(Path(config.poses or config.file), images)
+    number_of = {camera_id: i for i, camera_id in enumerate(dict.fromkeys(camera.camera_id for camera in known))}
+    camera_index = tuple(number_of[camera.camera_id] for camera in known)
+    cameras = [known[camera_index.index(number)] for number in range(len(number_of))]
+    for camera_id, camera in enumerate(cameras, start=1):
+        camera.camera_id = camera_id
+        camera.has_prior_focal_length = True
+    return Cameras(tuple(cameras), camera_index, known=True, cam_from_world=tuple(poses) if config.poses else ())
 
 
 def _camera_keys(images: Sequence[ImageRef], exif: Sequence[_ExifFocal], mode: str, known: bool) -> list[Hashable]:
@@ -157,7 +184,8 @@ def write_database(
 
     keypoints: one per image, in the order of the images; they are in COLMAP's frame already and are stored bit for
     bit as float32 (K, 2). matches: any pairs of these images; empty ones are left out. Image ids are 1..N in the order
-    of the images; each camera has a rig of its own, each image a frame of its own.
+    of the images; each camera has a rig of its own, each image a frame of its own. Positions from EXIF become pose
+    priors (latitude, longitude, altitude), for COLMAP's tools: the mappers here do not use them.
 
     Raises ValueError where the arguments contradict each other.
     """
@@ -190,6 +218,10 @@ def write_database(
                 frame.add_data_id(row.data_id)
                 database.write_frame(frame, use_frame_id=True)
                 database.write_keypoints(image_id, points.xy)
+                if image.gps:
+                    wgs84 = pycolmap.PosePriorCoordinateSystem.WGS84
+                    prior = pycolmap.PosePrior(position=image.gps, coordinate_system=wgs84, corr_data_id=row.data_id)
+                    database.write_pose_prior(prior)
             for pair_matches in matches:
                 if len(pair_matches):
                     pair = pair_matches.pair
@@ -221,3 +253,20 @@ def open_database(path: Path) -> pycolmap.Database:
     if not Path(path).is_file():  # pycolmap would create it
         raise InputError(f"there is no database {path}")
     return pycolmap.Database.open(path)
+
+
+def read_verified_matches(path: Path) -> dict[ImagePair, np.ndarray]:
+    """The matches of each pair that agree with its two-view geometry, (M, 2) int64 indices of keypoints, M > 0.
+
+    Raises InputError where there is no database.
+    """
+    with open_database(path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        pair_ids, geometries = database.read_two_view_geometries()
+    verified = {}
+    for pair_id, geometry in zip(pair_ids, geometries):
+        name0, name1 = (names[image_id] for image_id in pycolmap.pair_id_to_image_pair(pair_id))
+        matches = geometry.inlier_matches.astype(np.int64).reshape(-1, 2)
+        if len(matches):
+            verified[ImagePair.of(name0, name1)] = matches if name0 < name1 else matches[:, ::-1]
+    return verified

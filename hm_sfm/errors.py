@@ -27,6 +27,10 @@ class MissingPackageError(HmSfmError):
     """A package that only some commands need is not installed."""
 
 
+class WorkerLostError(HmSfmError):
+    """Processes that matched pairs died again and again."""
+
+
 class NoModelError(HmSfmError):
     """The mapper found no model; database and matches are kept."""
 

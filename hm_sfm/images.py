@@ -98,7 +98,9 @@ def list_images(folder: Path) -> ImageList:
 
 
 def read_ref(path: Path, name: str | None = None) -> ImageRef:
-    """Check one image file and read its stored size and EXIF rotation. `name` defaults to the file's own name.
+    """Check one image file and read its stored size, EXIF rotation and position.
+
+    `name` defaults to the file's own name.
 
     Raises InputError where the file cannot be read or decoded, is cut short, or is smaller than 32 px on a side.
     """
@@ -116,7 +118,15 @@ def read_ref(path: Path, name: str | None = None) -> ImageRef:
         raise InputError(f"{path} is cut short or cannot be decoded")
     size_wh = (bitmap.width, bitmap.height)
     _check_size(size_wh, str(path))
-    return ImageRef(name, path, size_wh, ROTATION_FROM_EXIF.get(bitmap.exif_orientation(), 0))
+    return ImageRef(name, path, size_wh, ROTATION_FROM_EXIF.get(bitmap.exif_orientation(), 0), _read_gps(bitmap))
+
+
+def _read_gps(bitmap: pycolmap.Bitmap) -> tuple[float, float, float] | None:
+    """ImageRef.gps; None unless EXIF has all of it, as COLMAP does, and where receivers without a fix left zeros."""
+    found = (bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude())
+    if None in found or not np.isfinite(found).all() or found[:2] == (0, 0):
+        return None
+    return found if abs(found[0]) <= 90 and abs(found[1]) <= 180 else None
 
 
 def prepare_image(ref: ImageRef, long_edge_px: int) -> PreparedImage:

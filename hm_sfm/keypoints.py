@@ -43,6 +43,16 @@ class Photo:
     """Px of the stored image per px of the matching resolution."""
     seeds: np.ndarray
     """(N, 2) px of the stored image: well-localised points, best first."""
+    hides: Callable[[np.ndarray], np.ndarray] | None = None
+    """(N, 2) px of the stored image -> (N,) bool: where no keypoint may be, in masked pixels; None: nowhere."""
+
+    def allows(self, xy: np.ndarray) -> np.ndarray:
+        """(N,) bool: whether keypoints may lie at xy, (N, 2) units: within the image and not masked."""
+        inside = np.all((xy >= 0) & (xy < np.array(self.size_wh) / self.px_per_unit), axis=1)
+        if self.hides:
+            # Rounded as Keypoints are: the edge of a mask must not lie between.
+            inside[inside] = ~self.hides((xy[inside] * self.px_per_unit).astype(np.float32))
+        return inside
 
 
 @dataclass(frozen=True)
@@ -140,18 +150,18 @@ def make_carriers(matches: PairMatches, px_per_unit0: float, px_per_unit1: float
 
 
 def carry_points(
-    xy: np.ndarray, carrier: Carrier, there_xy: np.ndarray, free: np.ndarray, size_there: np.ndarray,
-    config: KeypointConfig,
+    xy: np.ndarray, carrier: Carrier, there_xy: np.ndarray, free: np.ndarray, there: Photo, config: KeypointConfig,
 ) -> Carried:  # fmt: skip
     """Place points of one image in the other, one to one with what is there.
 
     xy: (N, 2) units; there_xy: (K, 2) keypoints of the other image, free (K,) bool: not yet linked in this pair;
-    size_there: (2,) units. A point is carried by the patches within carry_radius_px. It joins the free keypoint
+    there: the other image. A point is carried by the patches within carry_radius_px. It joins the free keypoint
     within join_radius_px where each is the other's nearest; it founds a keypoint where none lies within
-    separation_px, free or not, nor a better-scored founder; otherwise it is dropped.
+    separation_px, free or not, nor a better-scored founder; otherwise, and outside of the image and in its masked
+    pixels, it is dropped.
     """
     point, predicted, jacobian, score = predict_points(xy, carrier, config.carry_radius_px)
-    inside = np.all((predicted >= 0) & (predicted < size_there), axis=1)
+    inside = there.allows(predicted)
     point, predicted, jacobian, score = point[inside], predicted[inside], jacobian[inside], score[inside]
 
     nearest, distance = find_nearest(predicted, there_xy, config.separation_px)
@@ -228,6 +238,7 @@ def persist_keypoints(
     seeds = []
     for photo in photos:
         units = photo.seeds / photo.px_per_unit
+        units = units[photo.allows(units)]
         seeds.append(units[thin_points(units, config.separation_px)])
     strength = np.zeros(len(photos))
     for place, pair in enumerate(ranked_pairs):
@@ -248,23 +259,22 @@ def walk_pair(
 ) -> list[Links]:  # fmt: skip
     """Carry the keypoints of `first` into `second`, those left over in `second` back, then seed; grows both."""
     here, there = growing[first], growing[second]
-    size_first, size_second = (np.array(photos[i].size_wh) / photos[i].px_per_unit for i in (first, second))
 
     old_there = len(there.xy)
-    onward = carry_points(here.xy, carriers[0], there.xy, np.ones(old_there, bool), size_second, config)
+    onward = carry_points(here.xy, carriers[0], there.xy, np.ones(old_there, bool), photos[second], config)
     onward_links = Links(first, second, onward.point, there.settle(onward), onward)
 
     free_here = np.ones(len(here.xy), bool)
     free_here[onward_links.source] = False
     left = np.setdiff1d(np.arange(old_there), onward_links.target)
-    back = carry_points(there.xy[left], carriers[1], here.xy, free_here, size_first, config)
+    back = carry_points(there.xy[left], carriers[1], here.xy, free_here, photos[first], config)
     back_links = Links(second, first, left[back.point], here.settle(back), back)
 
     covered, _ = find_nearest(seeds, here.xy, config.seed_spacing_px)
     fresh = seeds[covered < 0]
     # A seed in first founds its partner in second; one that would join has a neighbour that was carried back.
     no_partner = np.zeros(len(there.xy), bool)
-    seeded = carry_points(fresh, carriers[0], there.xy, no_partner, size_second, config)
+    seeded = carry_points(fresh, carriers[0], there.xy, no_partner, photos[second], config)
     seed_links = Links(first, second, here.append(fresh[seeded.point]), there.settle(seeded), seeded)
     return [onward_links, back_links, seed_links]
 
@@ -286,14 +296,20 @@ def finish_keypoints(
     label = label_tracks(len(xy), source, target, score, image)
     same = label[source] == label[target]
     moved, sigma = adjust_keypoints(
-        xy, source[same], target[same], predicted[same], jacobian[same], weigh_scores(score[same])
+        xy,
+        source[same],
+        target[same],
+        predicted[same],
+        jacobian[same],
+        weigh_scores(score[same]),
+        config.adjustment_rounds,
     )
     residual = measure_residuals(xy, moved, source, target, predicted, jacobian)
     agreed = same & (residual <= config.join_radius_px)
     label = label_tracks(len(xy), source[agreed], target[agreed], score[agreed], image)
 
-    size = np.array([np.array(photo.size_wh) / photo.px_per_unit for photo in photos]).reshape(-1, 2)
-    inside = np.all((moved >= 0) & (moved < size[image]), axis=1)
+    inside = [photo.allows(moved[a:b]) for photo, a, b in zip(photos, start[:-1], start[1:])]
+    inside = np.concatenate([np.zeros(0, bool), *inside])
     length = measure_lengths(label)
     kept = inside & (length >= 2)
     kept[kept] = choose_budget(label[kept], length[kept], sigma[kept], moved[kept], image[kept], config.max_keypoints)

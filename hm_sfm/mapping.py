@@ -1,213 +1,66 @@
-"""Two-view verification, incremental mapping and bundle adjustment, through pycolmap.
+"""Stage 7: mapping, triangulation and bundle adjustment, through pycolmap.
 
 Ctrl-C raises KeyboardInterrupt out of each of these functions within a second or so: pycolmap asks for signals while
-it works, only the last adjustment of a model runs through. What is written to disk appears at once and complete, or
-not at all.
+it works; the last adjustment of a model, the global mapper and triangulation run through. What is written to disk
+appears at once and complete, or not at all.
 """
 
 import os
+import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-from tqdm import tqdm
 
-from hm_sfm.config import MappingConfig, VerificationConfig
-from hm_sfm.database import open_database
-from hm_sfm.types import ImagePair, ImageRef, MappingResult, PairMatches, freeze_array
-
-# Fewer matches than this prove nothing about an epipolar geometry.
-FEWEST_MATCHES = 8
-
-# verify_pair fits the geometry to at most so many matches and then tests all of them: the time of a trial grows with
-# the matches, the precision of the fit hardly does.
-FIT_MATCHES = 1000
-
-# Enough for 30 % inliers; pairs with more stop earlier, and pairs of different places never need to find anything.
-MAX_TRIALS = 1500
+from hm_sfm.colmap_models import quiet_colmap
+from hm_sfm.config import MappingConfig
+from hm_sfm.database import Cameras, open_database
+from hm_sfm.errors import ConfigError
+from hm_sfm.types import ImageRef, MappingResult
 
 # Global bundle adjustment each time the model grew by 30 %, not COLMAP's 10 %: about a fifth less time on dense
 # keypoints, at the same result; local bundle adjustment follows every image anyway.
 GLOBAL_ADJUSTMENT_RATIO = 1.3
 
+# Error of matches that calibration allows, of the longer side of the photos: what verification allows by default.
+CALIBRATION_ERROR = 0.003
 
-@dataclass(frozen=True)
-class VerifiedPair:
-    """A pair of images whose matches agree with a two-view geometry."""
-
-    pair: ImagePair
-    inliers: np.ndarray
-    """(M,) bool: which of the pair's matches agree."""
-    strength: float
-    """Number of inliers times the share of the image that they cover, in the image where it is smaller."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "inliers", freeze_array(self.inliers, np.bool_, (None,), "inliers"))
+# While a model grows, its adjustments end where they gain less than this (relative); the last one, over everything, is
+# exact. Half the time of COLMAP's own limits; points and poses are the same to a tenth of their error.
+GLOBAL_TOLERANCE = 1e-4
+LOCAL_TOLERANCE = 1e-3
+GLOBAL_REFINEMENTS = 2
+LOCAL_REFINEMENTS = 1
 
 
-@contextmanager
-def _quiet_colmap(level: pycolmap.logging.Level = pycolmap.logging.WARNING) -> Iterator[None]:
-    """Keep COLMAP's messages below `level` off stderr."""
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(before, int(level))
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before
-
-
-def _two_view_options(max_error_px: float, min_inliers: int, min_inlier_ratio: float, seed: int):
-    options = pycolmap.TwoViewGeometryOptions()
-    options.min_num_inliers = min_inliers
-    options.min_inlier_ratio = min_inlier_ratio
-    options.detect_watermark = False  # a label that nothing here reads
-    options.ransac.max_error = max_error_px
-    options.ransac.max_num_trials = MAX_TRIALS
-    options.ransac.random_seed = seed
-    return options
-
-
-def verify_pair(
-    matches: PairMatches,
-    camera0: pycolmap.Camera,
-    camera1: pycolmap.Camera,
-    max_error_px: float,
-    min_inliers: int,
-    min_inlier_ratio: float,
-    seed: int = 0,
-) -> np.ndarray:
-    """Which matches agree with the two-view geometry of their images.
-
-    camera0, camera1: of image 0 and 1; where both have a known focal length, the geometry is calibrated. Pairs that
-    see a plane, or that only rotate, are valid: matches then agree with a homography.
-    max_error_px: px of the stored images.
-
-    Returns (M,) bool, the same for the same seed; all False where fewer than `min_inliers` or a smaller part than
-    `min_inlier_ratio` of the matches agree, and for fewer than 8 matches.
-    """
-    rejected = np.zeros(len(matches), dtype=bool)
-    if len(matches) < FEWEST_MATCHES:
-        return rejected
-    xy0 = matches.xy0.astype(np.float64)
-    xy1 = matches.xy1.astype(np.float64)
-    # Matches come best first: even steps keep the mixture of good and bad, and the spread over the image.
-    chosen = np.linspace(0, len(matches) - 1, min(len(matches), FIT_MATCHES)).round().astype(np.int64)
-    identity = np.repeat(np.arange(len(chosen), dtype=np.uint32)[:, None], 2, axis=1)
-    with _quiet_colmap():
-        geometry = pycolmap.estimate_two_view_geometry(
-            camera0,
-            xy0[chosen],
-            camera1,
-            xy1[chosen],
-            identity,
-            _two_view_options(max_error_px, FEWEST_MATCHES, 0.0, seed),
-        )
-
-    kinds = pycolmap.TwoViewGeometryConfiguration
-    kind = kinds(geometry.config)
-    inliers = rejected
-    if kind == kinds.UNCALIBRATED:
-        inliers = _epipolar_inliers(xy0, xy1, geometry.F, max_error_px)
-    elif kind in (kinds.CALIBRATED, kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):
-        # As COLMAP does: a plane that dominates the pair must not cost it what stands before the plane.
-        if geometry.E is not None:
-            max_error = np.mean([camera.cam_from_img_threshold(max_error_px) for camera in (camera0, camera1)])
-            inliers = _epipolar_inliers(camera0.cam_from_img(xy0), camera1.cam_from_img(xy1), geometry.E, max_error)
-        if kind != kinds.CALIBRATED:
-            planar = _planar_inliers(xy0, xy1, geometry.H, max_error_px)
-            inliers = max(inliers, planar, key=np.count_nonzero)
-    accepted = np.count_nonzero(inliers) >= max(min_inliers, min_inlier_ratio * len(matches))
-    return inliers if accepted else rejected
-
-
-def _epipolar_inliers(xy0: np.ndarray, xy1: np.ndarray, matrix: np.ndarray, max_error: float) -> np.ndarray:
-    """(M,) bool: Sampson error within `max_error`, in the units of the points; points (M, 2), NaN is no inlier."""
-    squared = np.array(pycolmap.compute_squared_sampson_error(xy0, xy1, matrix))
-    return squared <= max_error**2
-
-
-def _planar_inliers(xy0: np.ndarray, xy1: np.ndarray, homography: np.ndarray, max_error_px: float) -> np.ndarray:
-    """(M,) bool: the homography puts the point of image 0 within `max_error_px` of its match; points (M, 2) px."""
-    projected = np.column_stack([xy0, np.ones(len(xy0))]) @ homography.T
-    with np.errstate(divide="ignore", invalid="ignore"):  # points on the horizon are no inliers
-        offset = projected[:, :2] / projected[:, 2:] - xy1
-    return (offset**2).sum(axis=1) <= max_error_px**2
-
-
-def verify_pairs(
+def map_images(
+    database_path: Path,
+    image_folder: Path,
+    sparse_folder: Path,
     images: Sequence[ImageRef],
-    pairs: Sequence[ImagePair],
-    read: Callable[[ImagePair], PairMatches],
-    cameras: Mapping[str, pycolmap.Camera],
-    px_per_unit: Mapping[str, float],
-    config: VerificationConfig,
-    quiet: bool = False,
-) -> dict[ImagePair, VerifiedPair]:
-    """verify_pair for many pairs; pairs that are rejected are left out.
+    cameras: Cameras,
+    config: MappingConfig,
+    on_image: Callable[[], None] | None = None,
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """Build models from a verified database: triangulate_images where the poses are known, else by `config.mapper`.
 
-    read: gives the matches of a pair. cameras, px_per_unit: by image name; px of the stored image per px of the
-    matching resolution, in which `config` states the error. quiet: no progress bar.
+    images, cameras: those that the database was written with. Arguments, results and what is raised are otherwise those
+    of map_incrementally; raises ConfigError where there is no such mapper.
     """
-    size_wh = {image.name: image.size_wh for image in images}
-    verified = {}
-    for pair in tqdm(pairs, desc="verify", unit="pair", disable=quiet):
-        matches = read(pair)
-        confident = np.flatnonzero(matches.score >= config.min_score)
-        agreeing = verify_pair(
-            matches.select(confident),
-            cameras[pair.name0],
-            cameras[pair.name1],
-            config.max_error_px * max(px_per_unit[pair.name0], px_per_unit[pair.name1]),
-            config.min_inliers,
-            config.min_inlier_ratio,
-        )
-        if is_convincing(np.count_nonzero(agreeing), len(confident), config):
-            inliers = np.zeros(len(matches), dtype=bool)
-            inliers[confident[agreeing]] = True
-            cover0 = measure_cover(matches.xy0[inliers], size_wh[pair.name0])
-            cover1 = measure_cover(matches.xy1[inliers], size_wh[pair.name1])
-            verified[pair] = VerifiedPair(pair, inliers, np.count_nonzero(inliers) * min(cover0, cover1))
-    return verified
+    if cameras.cam_from_world:
+        return triangulate_images(database_path, image_folder, sparse_folder, images, cameras, config, on_image)
+    build = choose_mapper(config)
+    return build(database_path, image_folder, sparse_folder, config, cameras.known, on_image)
 
 
-def is_convincing(inliers: int, matches: int, config: VerificationConfig) -> bool:
-    """Whether so many inliers among so many matches prove that two photos show the same place."""
-    sureness = min(inliers / config.sure_inliers, 1.0)
-    ratio = config.doubtful_inlier_ratio + sureness * (config.min_inlier_ratio - config.doubtful_inlier_ratio)
-    return inliers > 0 and inliers >= ratio * matches
-
-
-def measure_cover(xy: np.ndarray, size_wh: tuple[int, int]) -> float:
-    """Share of the cells of an 8 x 8 division of the image that hold a point. xy: (N, 2) px."""
-    cell = np.clip((xy / np.array(size_wh) * 8).astype(int), 0, 7)
-    return len(np.unique(cell[:, 1] * 8 + cell[:, 0])) / 64
-
-
-def verify_database(
-    path: Path,
-    max_error_px: float,
-    min_inliers: int,
-    min_inlier_ratio: float,
-    seed: int = 0,
-    num_threads: int = -1,
-) -> None:
-    """Estimate the two-view geometry of all matched pairs of a database and store it there, replacing earlier ones.
-
-    max_error_px: px of the stored images. num_threads: -1 takes all cores. Raises InputError where there is no
-    database.
-    """
-    with open_database(path) as database:
-        database.clear_two_view_geometries()  # pycolmap skips pairs that have one
-    verifier = pycolmap.GeometricVerifierOptions(num_threads=num_threads)
-    # Ctrl-C takes effect between batches.
-    pairing = pycolmap.ExistingMatchedPairingOptions(batch_size=4 * (os.cpu_count() or 1))
-    options = _two_view_options(max_error_px, min_inliers, min_inlier_ratio, seed)
-    with _quiet_colmap():
-        pycolmap.geometric_verification(path, verifier, pairing, options)
+def choose_mapper(config: MappingConfig) -> Callable[..., tuple[pycolmap.Reconstruction, ...]]:
+    """map_incrementally or map_globally. Raises ConfigError where `config.mapper` is neither."""
+    mappers = {"incremental": map_incrementally, "global": map_globally}
+    if config.mapper not in mappers:
+        raise ConfigError(f"mapping.mapper must be incremental or global, found {config.mapper!r}")
+    return mappers[config.mapper]
 
 
 def map_incrementally(
@@ -227,6 +80,68 @@ def map_incrementally(
     COLMAP binary, in this order; what the folder held before is gone, and without a model there is no folder.
     Raises InputError where there is no database.
     """
+    return _write_models(
+        database_path,
+        sparse_folder,
+        lambda raw: _run_mapper(database_path, image_folder, raw, config, fix_intrinsics, on_image),
+    )
+
+
+def map_globally(
+    database_path: Path,
+    image_folder: Path,
+    sparse_folder: Path,
+    config: MappingConfig,
+    fix_intrinsics: bool,
+    on_image: Callable[[], None] | None = None,
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """As map_incrementally, with COLMAP's global mapper: the rotations of all images, then all positions and points.
+
+    Focal lengths that nothing is known about are found first, from all pairs together; where that does not lead to a
+    model of all images, COLMAP's guess is tried, too. The database stays as it is. on_image is called when all is done.
+    The global mapper cannot be interrupted.
+
+    It needs matches that are one to one and tracks with one keypoint per image, which IndexMatches and
+    persist_keypoints guarantee: it stops at a match that occurs twice, and drops tracks whose observations in one image
+    are more than 10 px apart.
+    """
+    return _write_models(
+        database_path,
+        sparse_folder,
+        lambda raw: _run_global_mapper(database_path, image_folder, raw, config, fix_intrinsics, on_image),
+    )
+
+
+def triangulate_images(
+    database_path: Path,
+    image_folder: Path,
+    sparse_folder: Path,
+    images: Sequence[ImageRef],
+    cameras: Cameras,
+    config: MappingConfig,
+    on_image: Callable[[], None] | None = None,
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """The points of a verified database by the poses `cameras.cam_from_world`; poses and intrinsics stay as they are.
+
+    images, cameras: those that the database was written with. on_image is called when all is done.
+
+    Returns one model with all images, or none where no point was found; `sparse_folder` is as map_incrementally leaves
+    it. Raises InputError where there is no database.
+    """
+    return _write_models(
+        database_path,
+        sparse_folder,
+        lambda raw: _run_triangulator(database_path, image_folder, raw, images, cameras, config, on_image),
+    )
+
+
+def _write_models(
+    database_path: Path, sparse_folder: Path, build: Callable[[Path], list[pycolmap.Reconstruction]]
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """Sort the models that `build` makes, given a new folder to work in, and put them in the place of `sparse_folder`.
+
+    Without verified matches there is nothing to build. Raises InputError where there is no database.
+    """
     sparse_folder = Path(sparse_folder)
     sparse_folder.parent.mkdir(parents=True, exist_ok=True)
     with open_database(database_path) as database:
@@ -237,8 +152,8 @@ def map_incrementally(
             raw = Path(temporary) / "mapper"
             raw.mkdir()
             # The one error that COLMAP logs here is that there is no model, which the caller is told anyway.
-            with _quiet_colmap(pycolmap.logging.FATAL):
-                models = _run_mapper(database_path, image_folder, raw, config, fix_intrinsics, on_image)
+            with quiet_colmap(pycolmap.logging.FATAL):
+                models = build(raw)
         models.sort(key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
 
         finished = Path(temporary) / "sparse"
@@ -261,16 +176,7 @@ def _run_mapper(
     fix_intrinsics: bool,
     on_image: Callable[[], None] | None,
 ) -> list[pycolmap.Reconstruction]:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = config.seed
-    options.min_model_size = config.min_model_size
-    options.ba_global_frames_ratio = GLOBAL_ADJUSTMENT_RATIO
-    options.ba_global_points_ratio = GLOBAL_ADJUSTMENT_RATIO
-    if fix_intrinsics:
-        options.ba_refine_focal_length = False
-        options.ba_refine_principal_point = False
-        options.ba_refine_extra_params = False
-        options.max_extra_param = np.inf  # known distortion, however strong, is no sign of a failed calibration
+    options = _pipeline_options(config, fix_intrinsics)
 
     def on_initial_pair() -> None:
         on_image()
@@ -287,6 +193,115 @@ def _run_mapper(
     for model in models.values():
         _adjust(model, options)
     return list(models.values())
+
+
+def _pipeline_options(config: MappingConfig, fix_intrinsics: bool) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = config.seed
+    options.min_model_size = config.min_model_size
+    options.ba_global_frames_ratio = GLOBAL_ADJUSTMENT_RATIO
+    options.ba_global_points_ratio = GLOBAL_ADJUSTMENT_RATIO
+    options.ba_global_function_tolerance = GLOBAL_TOLERANCE
+    options.ba_local_function_tolerance = LOCAL_TOLERANCE
+    options.ba_global_max_refinements = GLOBAL_REFINEMENTS
+    options.ba_local_max_refinements = LOCAL_REFINEMENTS
+    if fix_intrinsics:
+        options.ba_refine_focal_length = False
+        options.ba_refine_principal_point = False
+        options.ba_refine_extra_params = False
+        options.max_extra_param = np.inf  # known distortion, however strong, is no sign of a failed calibration
+    return options
+
+
+def _run_global_mapper(
+    database_path: Path,
+    image_folder: Path,
+    output_folder: Path,
+    config: MappingConfig,
+    fix_intrinsics: bool,
+    on_image: Callable[[], None] | None,
+) -> list[pycolmap.Reconstruction]:
+    with open_database(database_path) as database:
+        cameras = database.read_all_cameras()
+        pair_ids, geometries = database.read_two_view_geometries()
+    verified = [pair_id for pair_id, geometry in zip(pair_ids, geometries) if len(geometry.inlier_matches)]
+    num_connected = len({image_id for pair_id in verified for image_id in pycolmap.pair_id_to_image_pair(pair_id)})
+    unknown_focal = not fix_intrinsics and not all(camera.has_prior_focal_length for camera in cameras)
+
+    def rank(models: list[pycolmap.Reconstruction]) -> tuple[int, int]:
+        return max(((model.num_reg_images(), model.num_points3D()) for model in models), default=(0, 0))
+
+    best: list[pycolmap.Reconstruction] = []
+    # Where all cameras look at one point, two views say nothing about the focal length, and calibration may return
+    # anything: COLMAP's guess, which adjustment refines, is then the better start.
+    for calibrate in (True, False) if unknown_focal else (False,):
+        own_copy = output_folder / "database.db"  # calibration writes to it
+        shutil.copy(database_path, own_copy)
+        if calibrate:
+            max_error_px = CALIBRATION_ERROR * max(max(camera.width, camera.height) for camera in cameras)
+            options = pycolmap.ViewGraphCalibrationOptions(random_seed=config.seed, relpose_max_error=max_error_px)
+            if not pycolmap.calibrate_view_graph(own_copy, options):
+                continue
+        best = max(best, _map_all(own_copy, image_folder, output_folder, config, fix_intrinsics), key=rank)
+        if rank(best)[0] == num_connected:
+            break
+    _report_images(best, on_image)
+    return best
+
+
+def _map_all(
+    database_path: Path, image_folder: Path, output_folder: Path, config: MappingConfig, fix_intrinsics: bool
+) -> list[pycolmap.Reconstruction]:
+    """The global mapper's models, adjusted, without the images that hardly any point supports."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = config.seed
+    options.min_model_size = config.min_model_size
+    if fix_intrinsics:
+        options.mapper.bundle_adjustment.refine_focal_length = False
+        options.mapper.bundle_adjustment.refine_principal_point = False
+        options.mapper.bundle_adjustment.refine_extra_params = False
+        options.mapper.retriangulation.max_extra_param = np.inf
+    models = list(pycolmap.global_mapping(database_path, image_folder, output_folder, options).values())
+    adjustment = _pipeline_options(config, fix_intrinsics)
+    for model in models:
+        _adjust(model, adjustment)
+        # It poses every image, the incremental mapper only those that so many points agree with.
+        fewest = adjustment.mapper.abs_pose_min_num_inliers
+        frames = {image.frame_id for image in model.images.values() if image.num_points3D < fewest}
+        for frame_id in frames & set(model.reg_frame_ids()):
+            model.deregister_frame(frame_id)
+    return [model for model in models if model.num_reg_images() >= config.min_model_size]
+
+
+def _run_triangulator(
+    database_path: Path,
+    image_folder: Path,
+    output_folder: Path,
+    images: Sequence[ImageRef],
+    cameras: Cameras,
+    config: MappingConfig,
+    on_image: Callable[[], None] | None,
+) -> list[pycolmap.Reconstruction]:
+    model = pycolmap.Reconstruction()
+    for camera in cameras.cameras:
+        model.add_camera_with_trivial_rig(camera)
+    rows = zip(images, cameras.camera_index, cameras.cam_from_world, strict=True)
+    for image_id, (image, index, cam_from_world) in enumerate(rows, start=1):  # the ids of write_database
+        row = pycolmap.Image(name=image.name, camera_id=cameras.cameras[index].camera_id, image_id=image_id)
+        model.add_image_with_trivial_frame(row, cam_from_world)
+    options = _pipeline_options(config, fix_intrinsics=True)
+    model = pycolmap.triangulate_points(model, database_path, image_folder, output_folder, options=options)
+    if not model.num_points3D():
+        return []
+    model.update_point_3d_errors()
+    _report_images([model], on_image)
+    return [model]
+
+
+def _report_images(models: Sequence[pycolmap.Reconstruction], on_image: Callable[[], None] | None) -> None:
+    """Call on_image for each registered image."""
+    for _ in range(sum(model.num_reg_images() for model in models) if on_image else 0):
+        on_image()
 
 
 def _adjust(model: pycolmap.Reconstruction, options: pycolmap.IncrementalPipelineOptions) -> None:

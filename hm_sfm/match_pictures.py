@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from hm_sfm.atomic import replace_file
-from hm_sfm.images import prepare_image, read_ref
+from hm_sfm.images import PreparedImage, prepare_image, read_ref
 from hm_sfm.pair_evaluation import PosePair
 from hm_sfm.types import PatchMatches, apply_homographies
 
@@ -42,20 +42,15 @@ class MatchPictures:
         self._draw_photos(pair.path0, pair.path1, matches, measure_epipolar_error(matches, pair))
 
     def draw_homography(self, path0: Path, path1: Path, truth: np.ndarray, matches: PatchMatches) -> None:
-        """The matches of two photos, with their errors against the homography truth (3, 3), px of stored image 0 -> 1."""
+        """The matches of two photos, with their errors against the homography truth (3, 3), px of photo 0 -> photo 1."""
         true = apply_homographies(np.broadcast_to(truth, (len(matches), 3, 3)), matches.xy0)
         self._draw_photos(path0, path1, matches, np.linalg.norm(true - matches.xy1, axis=1))
 
     def _draw_photos(self, path0: Path, path1: Path, matches: PatchMatches, error_px: np.ndarray) -> None:
         """error_px: (M,) px of stored image 1."""
-        images, places = [], []
-        for path, xy in ((path0, matches.xy0), (path1, matches.xy1)):
-            photo = prepare_image(read_ref(path), LONG_EDGE_PX)
-            scaled_from_stored = np.linalg.inv(photo.stored_from_scaled)
-            images.append(np.rint(photo.grey * 255).astype(np.uint8))
-            places.append(apply_homographies(np.broadcast_to(scaled_from_stored, (len(xy), 3, 3)), xy))
-        scale = np.sqrt(abs(np.linalg.det(scaled_from_stored[:2, :2])))
-        self._write(f"{path0.stem}-{path1.stem}", draw_matches(*images, *places, error_px * scale))
+        photos = [prepare_image(read_ref(path), LONG_EDGE_PX) for path in (path0, path1)]
+        picture = draw_photo_matches(*photos, matches.xy0, matches.xy1, error_px)
+        self._write(f"{path0.stem}-{path1.stem}", picture)
 
     def _write(self, name: str, picture: np.ndarray) -> None:
         _, code = cv2.imencode(".png", picture)
@@ -75,13 +70,35 @@ def measure_epipolar_error(matches: PatchMatches, pair: PosePair) -> np.ndarray:
     return np.abs((points1 * lines1).sum(axis=1)) / np.maximum(steepness, 1e-12)
 
 
+def draw_photo_matches(
+    photo0: PreparedImage, photo1: PreparedImage, xy0: np.ndarray, xy1: np.ndarray, error_px: np.ndarray,
+    caption: str | None = None,
+) -> np.ndarray:  # fmt: skip
+    """As draw_matches, of two photos and matches in px of the stored images; error_px: (M,) px of stored image 1."""
+    scale = np.sqrt(abs(np.linalg.det(photo1.stored_from_scaled[:2, :2])))
+    places = place_points(photo0, xy0), place_points(photo1, xy1)
+    return draw_matches(make_grey(photo0), make_grey(photo1), *places, error_px / scale, caption)
+
+
+def place_points(photo: PreparedImage, xy: np.ndarray) -> np.ndarray:
+    """Points (M, 2) px of the stored image -> (M, 2) float32 px of the prepared one."""
+    scaled_from_stored = np.linalg.inv(photo.stored_from_scaled)
+    return apply_homographies(np.broadcast_to(scaled_from_stored, (len(xy), 3, 3)), xy)
+
+
+def make_grey(photo: PreparedImage) -> np.ndarray:
+    """(H, W) uint8 of a prepared image."""
+    return np.rint(photo.grey * 255).astype(np.uint8)
+
+
 def draw_matches(
-    image0: np.ndarray, image1: np.ndarray, xy0: np.ndarray, xy1: np.ndarray, error_px: np.ndarray
-) -> np.ndarray:
+    image0: np.ndarray, image1: np.ndarray, xy0: np.ndarray, xy1: np.ndarray, error_px: np.ndarray,
+    caption: str | None = None,
+) -> np.ndarray:  # fmt: skip
     """One picture of two grey images (H, W) uint8 and at most MOST_LINES of their matches, evenly taken in their order.
 
-    xy0, xy1: (M, 2) px; error_px: (M,), NaN where it is unknown, which is drawn grey. Returns (max H, W0 + W1 + gap, 3)
-    uint8 BGR.
+    xy0, xy1: (M, 2) px; error_px: (M,), NaN where it is unknown, which is drawn grey. caption: instead of one that
+    counts the matches and their errors. Returns (max H, W0 + W1 + gap, 3) uint8 BGR.
     """
     shift = image0.shape[1] + GAP_PX
     picture = np.zeros((max(image0.shape[0], image1.shape[0]), shift + image1.shape[1], 3), np.uint8)
@@ -97,13 +114,22 @@ def draw_matches(
         cv2.line(picture, *ends, colour, 1, cv2.LINE_AA, SUBPIXEL_BITS)
         for end in ends:
             cv2.circle(picture, end, 2 * 2**SUBPIXEL_BITS, colour, cv2.FILLED, cv2.LINE_AA, SUBPIXEL_BITS)
+    text = count_errors(error_px) if caption is None else caption
+    if text:
+        # On a bar: an outline in a heavier weight has wider letters in OpenCV 5.
+        (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
+        cv2.rectangle(picture, (0, 0), (width + 12, 19), (0, 0, 0), cv2.FILLED)
+        cv2.putText(picture, text, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    return picture
+
+
+def count_errors(error_px: np.ndarray) -> str:
+    """How many matches there are, and which part of those with a known error is right. error_px: (M,), NaN unknown."""
     known = error_px[~np.isnan(error_px)]
-    text = f"{len(xy0)} matches"
+    text = f"{len(error_px)} matches"
     if len(known):
         text += f", {100 * (known < 1).mean():.0f} % within 1 px, {100 * (known < WORST_PX).mean():.0f} % within 5 px"
-    for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(picture, text, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, width, cv2.LINE_AA)
-    return picture
+    return text
 
 
 def pick_colour(error_px: float) -> tuple[int, int, int]:

@@ -1,14 +1,18 @@
 """Stage 3: image pairs -> PairMatches, each photo encoded about once, resumable."""
 
+import math
 import time
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 from tqdm import tqdm
 
+from hm_sfm.errors import ConfigError, MissingPackageError
 from hm_sfm.images import prepare_image
 from hm_sfm.network.model import HomoMatcher, ImageFeatures
+from hm_sfm.schedule import order_pairs
 from hm_sfm.store import MatchStore
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
@@ -52,14 +56,43 @@ class FeatureCache:
             self.progress.update()
         return features
 
+    def match(self, pair: ImagePair) -> PairMatches:
+        """Match two photos. Raises ConfigError where their features alone exceed the limit."""
+        if pair.name1 in self.cached:
+            self.get(pair.name1)  # it is not given up for the other
+        features = self.get(pair.name0), self.get(pair.name1)
+        size_bytes = sum(image.size_bytes for image in features)
+        if size_bytes > self.limit_bytes:
+            raise ConfigError(
+                f"matching.feature_cache_mb is {self.limit_bytes // 1_000_000}, but {pair.name0} and {pair.name1} "
+                f"alone take {math.ceil(size_bytes / 1_000_000)} MB: allow more, or reduce images.long_edge_px"
+            )
+        return PairMatches(pair=pair, **vars(self.matcher.match_features(*features)))
+
+
+def check_engine(name: str) -> None:
+    """Raises ConfigError where there is no such engine, MissingPackageError where its package is not installed."""
+    if name not in ("serial", "ray"):
+        raise ConfigError(f"matching.engine must be serial or ray, found {name!r}")
+    if name == "ray" and find_spec("ray") is None:
+        raise MissingPackageError(
+            'matching.engine ray needs the package ray, which is not installed: pip install "hm_sfm[ray]"'
+        )
+
 
 def match_pairs(
     images: Sequence[ImageRef], pairs: Sequence[ImagePair], matcher: HomoMatcher, store: MatchStore, quiet: bool = False
 ) -> MatchingTimes:
-    """Match the pairs that the store does not hold yet, and store them. Raises InputError on an undecodable photo.
+    """Match the pairs that the store does not hold yet, and store them, by the engine of the configuration.
 
-    Interrupted at any moment, what was stored stays; the same call goes on from there.
+    Raises InputError on an undecodable photo or a full disk, and what check_engine, FeatureCache.match and
+    match_on_cluster raise. Interrupted at any moment, what was stored stays; the same call goes on from there.
     """
+    check_engine(matcher.config.engine)
+    if matcher.config.engine == "ray":
+        from hm_sfm.cluster_matching import match_on_cluster
+
+        return match_on_cluster(images, pairs, matcher, store, quiet)
     missing = [pair for pair in pairs if pair not in store]
     started = stored_at = time.monotonic()
     names = {name for pair in missing for name in (pair.name0, pair.name1)}
@@ -71,10 +104,12 @@ def match_pairs(
         ) as pairs_bar,
     ):
         cache = FeatureCache(images, matcher, matcher.config.feature_cache_mb, images_bar)
+        if missing:
+            capacity = cache.limit_bytes // cache.get(missing[0].name0).size_bytes
+            missing = order_pairs(missing, max(2, capacity))
         try:
             for pair in missing:
-                found = matcher.match_features(cache.get(pair.name0), cache.get(pair.name1))
-                batch.append(PairMatches(pair=pair, **vars(found)))
+                batch.append(cache.match(pair))
                 pairs_bar.update()
                 if time.monotonic() - stored_at > BATCH_SECONDS:
                     store.write(batch)

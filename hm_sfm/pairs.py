@@ -1,16 +1,35 @@
 """Stage 2: which images to match with which."""
 
 import itertools
+import logging
 import re
-from collections.abc import Iterable, Sequence
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+import pycolmap
+
 from hm_sfm.atomic import replace_file
+from hm_sfm.colmap_models import quiet_colmap
 from hm_sfm.config import PairConfig
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.types import ImagePair
 
+logger = logging.getLogger(__name__)
+
+MODES = ("auto", "exhaustive", "sequential", "retrieval", "spatial")
 MAX_NAMES_LISTED = 20
+LOOP_WINDOWS = 4
+"""A sequence closes a loop where it comes back after more than so many windows."""
+LARGEST_STEP = 30
+"""Numbers in the names of neighbours in a sequence differ by no more than this."""
+
+Position = tuple[float, float, float]
+"""Latitude and longitude in degrees (WGS84) and altitude in m."""
+FindSimilar = Callable[[Sequence[str], int, int], np.ndarray]
+"""(names, top, gap) -> (N, top) int64: for each name the positions in `names` of the `top` images most like it that
+are more than `gap` places away, best first; -1 where there are no more."""
 
 # One name of a pairs file: in double quotes (a quote inside is doubled), or bare.
 NAME = r'(?:"(?:[^"]|"")*"|[^ \t"][^ \t]*)'
@@ -19,29 +38,59 @@ TWO_NAMES = re.compile(rf"[ \t]*({NAME})[ \t]+({NAME})[ \t]*")
 BARE_NAME = re.compile(r'[^\s"#\ufeff][^\s"]*')
 
 
-def select_pairs(names: Sequence[str], config: PairConfig) -> tuple[ImagePair, ...]:
-    """The pairs to match among the images `names`, as `config.mode` says: auto, exhaustive, sequential or a file.
+def select_pairs(
+    names: Sequence[str],
+    config: PairConfig,
+    find_similar: FindSimilar | None = None,
+    positions: Mapping[str, Position] | None = None,
+) -> tuple[ImagePair, ...]:
+    """The pairs to match among the images `names`, as `config.mode` says; each pair once.
 
-    auto takes all pairs of up to `config.exhaustive_limit` images, and of more the sequential pairs plus
-    `config.spread` evenly spaced partners of each image.
+    auto takes all pairs of up to `config.exhaustive_limit` images. Of more it takes each image with those most like
+    it, those taken nearest to it, and, where the images are a sequence, its followers: where their names are numbered
+    and most of the next ones are alike. Images without position have no neighbours by position.
 
-    Raises InputError where there are fewer than two images or the pairs file is unusable, ConfigError where the mode
-    does not exist.
+    find_similar: asked only where the mode needs to know which images look alike.
+
+    Raises InputError where there are fewer than two images, no pair at all, no positions for the mode spatial, or the
+    pairs file is unusable, ConfigError where the mode or a setting is impossible, ValueError where the mode needs
+    find_similar and there is none.
     """
     if len(names) < 2:
         raise InputError(f"at least 2 images are needed to make a pair, found {len(names)}")
-    if config.mode == "retrieval":
-        raise ConfigError("pairs mode 'retrieval' does not exist yet: use 'auto', or a pairs file made by another tool")
+    for key in ("window", "retrieval_top", "spatial_top"):
+        if getattr(config, key) < 1:
+            raise ConfigError(f"pairs.{key} must be at least 1, found {getattr(config, key)}")
+    if config.mode not in MODES and not Path(config.mode).exists():
+        modes = f"{', '.join(MODES[:-1])} or {MODES[-1]}"
+        raise InputError(f"pairs {config.mode!r} is neither {modes} nor a file that exists")
+    if config.mode not in MODES:
+        return read_pairs(Path(config.mode), names)
     if config.mode == "exhaustive" or (config.mode == "auto" and len(names) <= config.exhaustive_limit):
         return pair_exhaustively(names)
+
+    ordered = sorted(names, key=_natural_key)
+    pairs: list[ImagePair] = []
+    if config.mode in ("auto", "retrieval"):
+        pairs += _pair_similar(ordered, find_similar, config.retrieval_top)
+    if config.mode == "auto" and _is_numbered(ordered):
+        followers = _pair_at_distances(ordered, [1])
+        if 2 * len(set(followers).intersection(pairs)) >= len(followers):
+            pairs += _pair_at_distances(ordered, range(1, config.window + 1))
     if config.mode == "sequential":
-        return pair_sequentially(names, config.window)
-    if config.mode == "auto":
-        pairs = pair_sequentially(names, config.window) + pair_evenly(names, config.spread)
-        return tuple(dict.fromkeys(pairs))
-    if not Path(config.mode).exists():
-        raise InputError(f"pairs {config.mode!r} is neither auto, exhaustive or sequential nor a file that exists")
-    return read_pairs(Path(config.mode), names)
+        pairs += pair_sequentially(names, config.window)
+        if config.loop_top:
+            pairs += _pair_similar(ordered, find_similar, config.loop_top, LOOP_WINDOWS * config.window)
+    if config.mode == "spatial" and not positions:
+        raise InputError(f"pairs mode 'spatial' needs photos with a GPS position in EXIF, found none in {len(names)}")
+    if config.mode == "spatial" and len(positions) < len(names):
+        lacking = len(names) - len(positions)
+        logger.warning("%d of %d photos have no GPS position in EXIF: they are in no pair", lacking, len(names))
+    if config.mode in ("auto", "spatial") and positions:
+        pairs += pair_spatially(positions, config.spatial_top, config.spatial_distance_m)
+    if not pairs:
+        raise InputError(f"pairs mode {config.mode!r} finds no pair among {len(names)} images: use another mode")
+    return tuple(dict.fromkeys(pairs))
 
 
 def pair_exhaustively(names: Sequence[str]) -> tuple[ImagePair, ...]:
@@ -58,33 +107,24 @@ def pair_sequentially(names: Sequence[str], window: int) -> tuple[ImagePair, ...
     """
     if window < 1:
         raise ConfigError(f"pairs.window must be at least 1, found {window}")
-    ordered = sorted(names, key=_natural_key)
-    powers = [2**k for k in range(len(ordered).bit_length()) if 2**k > window]
-    distances = [*range(1, min(window, len(ordered)) + 1), *powers]
-    return tuple(
-        ImagePair.of(name, ordered[i + distance])
-        for i, name in enumerate(ordered)
-        for distance in distances
-        if i + distance < len(ordered)
-    )
+    powers = [2**k for k in range(len(names).bit_length()) if 2**k > window]
+    return _pair_at_distances(sorted(names, key=_natural_key), [*range(1, min(window, len(names)) + 1), *powers])
 
 
-def pair_evenly(names: Sequence[str], spread: int) -> tuple[ImagePair, ...]:
-    """Each image with `spread` partners that divide the sequence evenly, taken as a ring; fewer if there are fewer.
+def pair_spatially(positions: Mapping[str, Position], top: int, distance_m: float) -> tuple[ImagePair, ...]:
+    """Each image with the `top` images taken nearest to it, none farther away than `distance_m`, by COLMAP.
 
-    Where both `spread` and the number of images are odd, each image gets one partner more. The sequence is the natural
-    order of `names`.
-
-    Raises ConfigError where spread is negative.
+    positions: latitude and longitude in degrees (WGS84) and altitude in m, which is ignored, by image name.
     """
-    if spread < 0:
-        raise ConfigError(f"pairs.spread must not be negative, found {spread}")
-    ordered = sorted(names, key=_natural_key)
-    count = len(ordered)
-    # Half of the ring: the partners in the other half are those whose own distances reach back.
-    distances = sorted({round(k * count / (spread + 1)) for k in range(1, (spread + 1) // 2 + 1)} - {0})
-    pairs = (ImagePair.of(ordered[i], ordered[(i + distance) % count]) for i in range(count) for distance in distances)
-    return tuple(dict.fromkeys(pairs))
+    names = sorted(positions)
+    with tempfile.TemporaryDirectory() as folder, quiet_colmap():
+        with pycolmap.Database.open(Path(folder) / "positions.db") as database:
+            _write_positions(database, names, positions)
+            options = pycolmap.SpatialPairingOptions(
+                max_num_neighbors=top, max_distance=distance_m, ignore_z=True, num_threads=1
+            )
+            found = pycolmap.SpatialPairGenerator(options, database).all_pairs()
+    return tuple(dict.fromkeys(ImagePair.of(names[a - 1], names[b - 1]) for a, b in sorted(found)))
 
 
 def read_pairs(path: Path, names: Sequence[str]) -> tuple[ImagePair, ...]:
@@ -141,6 +181,110 @@ def write_pairs(path: Path, pairs: Iterable[ImagePair]) -> None:
     lines = [f"{_quote(pair.name0)} {_quote(pair.name1)}\n" for pair in pairs]
     with replace_file(path) as temporary:
         temporary.write_bytes("".join(lines).encode())
+
+
+def _pair_at_distances(ordered: Sequence[str], distances: Iterable[int]) -> tuple[ImagePair, ...]:
+    distances = tuple(distances)
+    return tuple(
+        ImagePair.of(name, ordered[i + distance])
+        for i, name in enumerate(ordered)
+        for distance in distances
+        if i + distance < len(ordered)
+    )
+
+
+def _pair_similar(
+    ordered: Sequence[str], find_similar: FindSimilar | None, top: int, gap: int = 0
+) -> tuple[ImagePair, ...]:
+    """Each image with the `top` ones most like it: a pair that one of the two proposes is enough."""
+    if find_similar is None:
+        raise ValueError(f"to pair {len(ordered)} images by their looks, select_pairs needs find_similar")
+    found = find_similar(ordered, min(top, len(ordered) - 1), gap)
+    return tuple(
+        dict.fromkeys(
+            ImagePair.of(ordered[i], ordered[j]) for i, row in enumerate(found.tolist()) for j in row if j >= 0
+        )
+    )
+
+
+def _is_numbered(ordered: Sequence[str]) -> bool:
+    """Whether most names differ from the next one in nothing but a number that is a little higher there."""
+    keys = [_natural_key(name)[0] for name in ordered]
+    steps = [
+        [(one, other) for one, other in zip(key, after) if one != other] if len(key) == len(after) else []
+        for key, after in itertools.pairwise(keys)
+    ]
+    numbered = [
+        len(step) == 1 and isinstance(step[0][0], int) and 0 < step[0][1] - step[0][0] <= LARGEST_STEP for step in steps
+    ]
+    return 2 * sum(numbered) > len(numbered)
+
+
+def _write_positions(database: pycolmap.Database, names: Sequence[str], positions: Mapping[str, Position]) -> None:
+    """Images 1, 2 ... with their positions, and a camera only because COLMAP wants one."""
+    camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId.SIMPLE_PINHOLE, 1.0, 1, 1)
+    with pycolmap.DatabaseTransaction(database):
+        database.write_camera(camera, use_camera_id=True)
+        for image_id, name in enumerate(names, start=1):
+            image = pycolmap.Image(name=name, camera_id=1, image_id=image_id)
+            database.write_image(image, use_image_id=True)
+            wgs84 = pycolmap.PosePriorCoordinateSystem.WGS84
+            prior = pycolmap.PosePrior(
+                corr_data_id=image.data_id, position=np.array(positions[name]), coordinate_system=wgs84
+            )
+            database.write_pose_prior(prior)
+
+
+def _pair_at_distances(ordered: Sequence[str], distances: Iterable[int]) -> tuple[ImagePair, ...]:
+    distances = tuple(distances)
+    return tuple(
+        ImagePair.of(name, ordered[i + distance])
+        for i, name in enumerate(ordered)
+        for distance in distances
+        if i + distance < len(ordered)
+    )
+
+
+def _pair_similar(
+    ordered: Sequence[str], find_similar: FindSimilar | None, top: int, gap: int = 0
+) -> tuple[ImagePair, ...]:
+    """Each image with the `top` ones most like it: a pair that one of the two proposes is enough."""
+    if find_similar is None:
+        raise ValueError(f"to pair {len(ordered)} images by their looks, select_pairs needs find_similar")
+    found = find_similar(ordered, min(top, len(ordered) - 1), gap)
+    return tuple(
+        dict.fromkeys(
+            ImagePair.of(ordered[i], ordered[j]) for i, row in enumerate(found.tolist()) for j in row if j >= 0
+        )
+    )
+
+
+def _is_numbered(ordered: Sequence[str]) -> bool:
+    """Whether most names differ from the next one in nothing but a number that is a little higher there."""
+    keys = [_natural_key(name)[0] for name in ordered]
+    steps = [
+        [(one, other) for one, other in zip(key, after) if one != other] if len(key) == len(after) else []
+        for key, after in itertools.pairwise(keys)
+    ]
+    numbered = [
+        len(step) == 1 and isinstance(step[0][0], int) and 0 < step[0][1] - step[0][0] <= LARGEST_STEP for step in steps
+    ]
+    return 2 * sum(numbered) > len(numbered)
+
+
+def _write_positions(database: pycolmap.Database, names: Sequence[str], positions: Mapping[str, Position]) -> None:
+    """Images 1, 2 ... with their positions, and a camera only because COLMAP wants one."""
+    camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId.SIMPLE_PINHOLE, 1.0, 1, 1)
+    with pycolmap.DatabaseTransaction(database):
+        database.write_camera(camera, use_camera_id=True)
+        for image_id, name in enumerate(names, start=1):
+            image = pycolmap.Image(name=name, camera_id=1, image_id=image_id)
+            database.write_image(image, use_image_id=True)
+            wgs84 = pycolmap.PosePriorCoordinateSystem.WGS84
+            prior = pycolmap.PosePrior(
+                corr_data_id=image.data_id, position=np.array(positions[name]), coordinate_system=wgs84
+            )
+            database.write_pose_prior(prior)
 
 
 def _parse_line(line: str, where: str) -> tuple[str, str]:

@@ -5,31 +5,46 @@ Each function runs the chain up to its stage and picks up what an earlier run le
 
 import dataclasses
 import json
+import logging
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 from tqdm import tqdm
 
 from hm_sfm.atomic import replace_file
 from hm_sfm.config import Config, fingerprint
 from hm_sfm.database import Cameras, make_cameras, write_database
+from hm_sfm.diagnosis import Diagnosis, diagnose
 from hm_sfm.errors import InputError, NoModelError
 from hm_sfm.hloc import write_features, write_matches
 from hm_sfm.images import list_images, prepare_image
 from hm_sfm.keypoints import Photo, find_seeds, persist_keypoints
-from hm_sfm.mapping import VerifiedPair, map_incrementally, summarise_models, verify_database, verify_pairs
-from hm_sfm.matching import match_pairs
+from hm_sfm.locks import lock_file, release_locks, wait_in_line
+from hm_sfm.mapping import choose_mapper, map_images, summarise_models
+from hm_sfm.masks import NO_MASKS, MaskedStore, Masks, read_masks
+from hm_sfm.matching import check_engine, match_pairs
 from hm_sfm.network.model import HomoMatcher, digest_weights
-from hm_sfm.pairs import select_pairs, write_pairs
+from hm_sfm.pairs import read_pairs, select_pairs, write_pairs
+from hm_sfm.report_figures import gather_report
+from hm_sfm.report_page import write_report
+from hm_sfm.retrieval import CellStore, describe_images, find_similar
+from hm_sfm.shards import Shard, merge_shards, refuse_shards
 from hm_sfm.store import MatchStore, digest_image
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, MappingResult
+from hm_sfm.verification import VerifiedPair, verify_database, verify_pairs
+
+logger = logging.getLogger(__name__)
 
 MARKER = ".hm_sfm"
 """File by which a folder is known as the output of a run."""
+UNDESCRIBED = {("matching", key) for key in ("device", "feature_cache_mb", "model", "engine")}
+"""Settings that the matches do not depend on; the model's weights are described instead of their name."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +56,19 @@ class Matched:
     """Files that are named like images but cannot be used."""
     pairs: tuple[ImagePair, ...]
     cameras: Cameras
-    store: MatchStore
+    store: MaskedStore
+    """Reads the matches that are not masked."""
     seconds: dict[str, float]
 
 
-def match_photos(image_folder: Path, out: Path, config: Config, quiet: bool = False) -> Matched:
+@release_locks()
+def match_photos(
+    image_folder: Path, out: Path, config: Config, quiet: bool = False, shard: Shard | None = None
+) -> Matched:
     """Photos -> OUT/pairs.txt and OUT/matches.h5.
+
+    shard: match only its part of the pairs, into a file of its own, see Shard.locate; the result has these pairs only.
+    Shards of one OUT may be matched at the same time, and merge_matches gathers them.
 
     Raises InputError on unusable photos, pairs, or OUT, StaleResultError where OUT holds another run's matches,
     WeightsError and ConfigError on an unusable model or setting; nothing in OUT is lost then.
@@ -54,18 +76,47 @@ def match_photos(image_folder: Path, out: Path, config: Config, quiet: bool = Fa
     out = Path(out)
     listed = list_images(image_folder)
     images = listed.images
-    pairs = select_pairs([image.name for image in images], config.pairs)
+    check_engine(config.matching.engine)
+    pairs = choose_pairs(images, out, config, quiet, shared=shard is not None)
     cameras = make_cameras(images, config.cameras)
-    claim_folder(out)
+    masks = read_masks(images, config.masks)  # all bad input is found before anything is computed
+    choose_mapper(config.mapping)
+    claim_folder(out, shared=shard is not None)
+    if shard:
+        shard.lock(out)
+    else:
+        refuse_shards(out)
     matcher = HomoMatcher.from_pretrained(
         config.matching.model, config=config.matching, images=config.images, network=config.network
     )
     store = open_store(out / "matches.h5", images, config)
-    write_pairs(out / "pairs.txt", pairs)
+    if shard:
+        shard.write_pairs(out, pairs)
+        pairs = tuple(pair for pair in shard.take(pairs) if pair not in store)
+        store = MatchStore(shard.locate(out), store.made_by, store.digests)
+    else:
+        write_pairs(out / "pairs.txt", pairs)
     times = match_pairs(images, pairs, matcher, store, quiet)
-    return Matched(images, len(listed.skipped), pairs, cameras, store, dataclasses.asdict(times))
+    seconds = dataclasses.asdict(times)
+    return Matched(images, len(listed.skipped), pairs, cameras, MaskedStore(store, masks), seconds)
 
 
+@release_locks()
+def merge_matches(image_folder: Path, out: Path, config: Config) -> int:
+    """Gather the shards of OUT in OUT/matches.h5 and remove them; returns the number of pairs, those of OUT/pairs.txt.
+
+    Raises InputError where OUT has no pairs, is in use, or a shard is missing or unfinished, StaleResultError where one
+    was made by other settings or of other photos; nothing is changed then.
+    """
+    out = Path(out)
+    images = list_images(image_folder).images
+    pairs = read_pairs(out / "pairs.txt", [image.name for image in images])
+    claim_folder(out)
+    merge_shards(open_store(out / "matches.h5", images, config), pairs, out)
+    return len(pairs)
+
+
+@release_locks()
 def export_database(image_folder: Path, out: Path, config: Config, quiet: bool = False) -> Matched:
     """As match_photos, then OUT/database.db with persistent keypoints and verified matches."""
     matched = match_photos(image_folder, out, config, quiet)
@@ -82,6 +133,7 @@ def export_database(image_folder: Path, out: Path, config: Config, quiet: bool =
     return matched
 
 
+@release_locks()
 def export_hloc(image_folder: Path, out: Path, config: Config, quiet: bool = False) -> Matched:
     """As match_photos, then OUT/hloc/features.h5 and OUT/hloc/matches.h5 with persistent keypoints, as hloc reads them.
 
@@ -112,13 +164,15 @@ def verify_and_carry(
             quiet,
         )
     with stopwatch(matched.seconds, "keypoints"):
-        return carry_keypoints(images, verified, matched.store, config, quiet)
+        return carry_keypoints(images, verified, matched.store, config, quiet, matched.store.masks)
 
 
+@release_locks()
 def reconstruct(image_folder: Path, out: Path, config: Config, quiet: bool = False) -> MappingResult:
-    """As export_database, then OUT/sparse and OUT/summary.json.
+    """As export_database, then OUT/sparse, OUT/summary.json and OUT/report.html.
 
-    Raises NoModelError where the mapper finds no model; database, matches and summary.json are kept.
+    What kept images out of the model is logged as warnings, too. Raises NoModelError where the mapper finds no model;
+    database, matches, summary.json and report.html are kept.
     """
     started = time.monotonic()
     matched = export_database(image_folder, out, config, quiet)
@@ -127,17 +181,25 @@ def reconstruct(image_folder: Path, out: Path, config: Config, quiet: bool = Fal
         stopwatch(matched.seconds, "map"),
         tqdm(total=len(matched.images), desc="mapping", unit="image", disable=quiet) as progress,
     ):
-        models = map_incrementally(
+        models = map_images(
             out / "database.db",
             Path(image_folder),
             out / "sparse",
+            matched.images,
+            matched.cameras,
             config.mapping,
-            fix_intrinsics=bool(config.cameras.params),
             on_image=progress.update,
         )
     result = summarise_models(models, len(matched.images))
     matched.seconds["total"] = time.monotonic() - started
-    write_summary(out / "summary.json", result, matched, config)
+    diagnoses = diagnose(
+        matched.images, matched.cameras, matched.pairs, matched.store.read, out / "database.db", models, config
+    )
+    write_summary(out / "summary.json", Path(image_folder), result, diagnoses, matched, config)
+    report = gather_report(out, matched.images, len(matched.pairs), models, diagnoses, config)
+    write_report(out / "report.html", report)
+    for diagnosis in diagnoses:
+        logger.warning("%s", diagnosis)
     if not models:
         raise NoModelError(
             f"no model could be built from {len(matched.images)} images; matches and database are kept in {out}"
@@ -145,13 +207,44 @@ def reconstruct(image_folder: Path, out: Path, config: Config, quiet: bool = Fal
     return result
 
 
-def claim_folder(out: Path) -> None:
-    """Make OUT, or check that it is empty or an earlier run's. Raises InputError where it is not, or not writable."""
+def choose_pairs(
+    images: Sequence[ImageRef], out: Path, config: Config, quiet: bool = False, shared: bool = False
+) -> tuple[ImagePair, ...]:
+    """select_pairs for these photos. Where it must know which look alike, OUT is claimed and they are encoded into it.
+
+    shared: OUT, as in claim_folder. Raises what select_pairs, claim_folder and HomoMatcher.from_pretrained raise, and
+    InputError on an undecodable photo; those encoded by then stay encoded.
+    """
+    image_of = {image.name: image for image in images}
+
+    def rank_by_looks(names: Sequence[str], top: int, gap: int) -> np.ndarray:
+        claim_folder(Path(out), shared)
+        matcher = HomoMatcher.from_pretrained(
+            config.matching.model, config=config.matching, images=config.images, network=config.network
+        )
+        photos = [image_of[name] for name in names]
+        digests = {image.name: digest_image(image) for image in photos}
+        folder = Path(out) / "retrieval"
+        with wait_in_line(folder / ".lock"):  # other shards find the photos encoded
+            store = CellStore(folder, digest_weights(config.matching.model))
+            return find_similar(describe_images(photos, digests, matcher, store, quiet), top, gap)
+
+    positions = {image.name: image.gps for image in images if image.gps}
+    return select_pairs([image.name for image in images], config.pairs, rank_by_looks, positions)
+
+
+def claim_folder(out: Path, shared: bool = False) -> None:
+    """Make OUT, or check that it is empty or an earlier run's, and lock it, see hm_sfm.locks.
+
+    shared: with other processes that share it. Raises InputError where OUT is somebody else's, not writable, or in use.
+    """
     try:
         out.mkdir(parents=True, exist_ok=True)
         foreign = any(out.iterdir()) and not (out / MARKER).exists()
         if not foreign:
             (out / MARKER).touch()
+            in_use = f"the output folder {out} is in use by another hm-sfm process: wait for it, or name another OUT"
+            lock_file(out / MARKER, in_use, shared)
     except OSError as error:
         raise InputError(f"cannot write to the output folder {out}: {error.strerror}") from error
     if foreign:
@@ -163,7 +256,7 @@ def describe_matching(config: Config) -> dict[str, object]:
     described: dict[str, object] = {"weights": digest_weights(config.matching.model)}
     for section in ("network", "images", "matching"):
         for key, value in dataclasses.asdict(getattr(config, section)).items():
-            if (section, key) not in {("matching", "device"), ("matching", "feature_cache_mb"), ("matching", "model")}:
+            if (section, key) not in UNDESCRIBED:
                 described[f"{section}.{key}"] = value
     return described
 
@@ -181,11 +274,14 @@ def measure_units(images: Sequence[ImageRef], config: Config) -> dict[str, float
 def carry_keypoints(
     images: Sequence[ImageRef],
     verified: Mapping[ImagePair, VerifiedPair],
-    store: MatchStore,
+    store: MatchStore | MaskedStore,
     config: Config,
     quiet: bool = False,
+    masks: Masks = NO_MASKS,
 ) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
     """persist_keypoints over the verified pairs, strongest first. Raises InputError on an undecodable photo.
+
+    store: what the pairs were verified with. masks: no keypoint lies in a masked pixel.
 
     Returns the Keypoints of every image, in the order of `images`, and the IndexMatches of the pairs that share tracks.
     """
@@ -196,6 +292,7 @@ def carry_keypoints(
             image.size_wh,
             px_per_unit[image.name],
             find_seeds(prepare_image(image, config.images.long_edge_px)),
+            partial(masks.hides, image.name) if image.name in masks.packed else None,
         )
         for image in tqdm(images, desc="seeds", unit="image", disable=quiet)
     ]
@@ -209,12 +306,23 @@ def carry_keypoints(
     )
 
 
-def write_summary(path: Path, result: MappingResult, matched: Matched, config: Config) -> None:
+def write_summary(
+    path: Path,
+    image_folder: Path,
+    result: MappingResult,
+    diagnoses: Sequence[Diagnosis],
+    matched: Matched,
+    config: Config,
+) -> None:
     """OUT/summary.json, atomically."""
     figures = {
+        "image_folder": str(image_folder.resolve()),
         "num_images": result.num_images,
         "skipped_images": matched.skipped,
         "registered": result.registered,
+        "unregistered": {
+            name: f"{found.cause.value}: {reason}" for found in diagnoses for name, reason in found.reasons.items()
+        },
         "models": len(result.models),
         "points": result.points,
         "observations": result.observations,

@@ -5,10 +5,14 @@ they are merged into matches.h5, which also appears at once. Every pair carries 
 every file that of the configuration and the weights, so nothing stale is ever used.
 """
 
+import errno
 import hashlib
 import json
+import os
+import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +33,34 @@ def digest_image(image: ImageRef) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()[:16]
     except OSError as error:
         raise InputError(f"cannot read the image {image.path}: {error.strerror}") from error
+
+
+@contextmanager
+def name_disk_errors(path: Path) -> Iterator[None]:
+    """Raises InputError where `path` cannot be written, because the disk is full or for another reason."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        # HDF5 hides the reason in a long text, and the first error behind those of closing the file.
+        text = " ".join(f"{error} {error.__context__}".split())
+        number = re.search(r"errno = ([0-9]+)|\[Errno ([0-9]+)\]", text)
+        reason = os.strerror(int(number[1] or number[2])) if number else text
+        raise InputError(f"cannot write {path}: {reason}") from error
+
+
+def require_room(path: Path, size_bytes: int) -> None:
+    """Raises OSError where the disk has no room for `path`: where HDF5 finds that out, the process can crash."""
+    probe = path.with_name(path.name + ".tmp")
+    try:
+        with open(probe, "wb") as file:
+            os.posix_fallocate(file.fileno(), 0, max(1, size_bytes))
+    except AttributeError:  # not all systems can tell
+        pass
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise
+    finally:
+        probe.unlink(missing_ok=True)
 
 
 class MatchStore:
@@ -65,35 +97,54 @@ class MatchStore:
             )
 
     def write(self, batch: Sequence[PairMatches]) -> None:
-        """Store a batch of pairs: after a crash either all of them are there or none."""
+        """Store a batch of pairs: after a crash either all of them are there or none.
+
+        Raises InputError where the disk is full or refuses; what was stored before stays.
+        """
         if not batch:
             return
         self.parts.mkdir(parents=True, exist_ok=True)
         last = max((int(path.stem) for path in self.parts.glob("*.h5")), default=-1)
         path = self.parts / f"{last + 1:06d}.h5"
-        with replace_file(path) as temporary, h5py.File(temporary, "w") as h5:
+        # In memory first: HDF5 itself can crash on a full disk.
+        with h5py.File(path.name, "w", driver="core", backing_store=False) as h5:
             self._stamp(h5)
             for number, matches in enumerate(batch):
                 self._write_pair(h5, f"{number:06d}", matches)
+            h5.flush()
+            content = h5.id.get_file_image()
+        with name_disk_errors(path), replace_file(path) as temporary:
+            temporary.write_bytes(content)
         for number, matches in enumerate(batch):
             self._where[matches.pair] = (path, f"{number:06d}")
 
+    def adopt(self, other: "MatchStore") -> None:
+        """Take in the pairs of another store that this one lacks; merge copies them."""
+        self._where = other._where | self._where
+
     def merge(self) -> None:
-        """Gather everything that is still valid in matches.h5 and remove the batches."""
-        if not self.parts.exists() and self.path.exists():
+        """Gather everything that is still valid in matches.h5, in the order of the pairs, and remove the batches.
+
+        Raises InputError where the disk is full or refuses; the batches stay then, and nothing is lost.
+        """
+        adopted = any(file.parent != self.parts and file != self.path for file, _ in self._where.values())
+        if self.path.exists() and not self.parts.exists() and not adopted:
             return
         where = {}
-        with replace_file(self.path) as temporary, h5py.File(temporary, "w") as merged:
+        # The same names of groups, whatever was matched first, and where.
+        groups = {pair: f"{number:06d}" for number, pair in enumerate(sorted(self._where))}
+        by_file: dict[Path, list[ImagePair]] = {}
+        for pair, (file, _) in self._where.items():
+            by_file.setdefault(file, []).append(pair)
+        with name_disk_errors(self.path):
+            require_room(self.path, sum(file.stat().st_size for file in by_file))
+        with name_disk_errors(self.path), replace_file(self.path) as temporary, h5py.File(temporary, "w") as merged:
             self._stamp(merged)
-            by_file: dict[Path, list[ImagePair]] = {}
-            for pair, (file, _) in self._where.items():
-                by_file.setdefault(file, []).append(pair)
             for file, pairs in by_file.items():
                 with h5py.File(file, "r") as h5:
                     for pair in pairs:
-                        group = f"{len(where):06d}"
-                        h5.copy(self._where[pair][1], merged, group)
-                        where[pair] = (self.path, group)
+                        h5.copy(self._where[pair][1], merged, groups[pair])
+                        where[pair] = (self.path, groups[pair])
         self._where = where
         shutil.rmtree(self.parts, ignore_errors=True)
 

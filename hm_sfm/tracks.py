@@ -4,6 +4,7 @@ Keypoints are numbered through all images here: keypoint k of image i has the gl
 """
 
 import numpy as np
+import pycolmap
 
 from hm_sfm.types import Tracks
 
@@ -84,3 +85,41 @@ def measure_lengths(label: np.ndarray) -> np.ndarray:
     """(K,) int64: for each keypoint, how many keypoints its track holds."""
     _, inverse, count = np.unique(label, return_inverse=True, return_counts=True)
     return count[inverse]
+
+
+def list_observations(model: pycolmap.Reconstruction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the images of a model see: (O,) int64 each, the id of the point, the image and the index of the keypoint.
+
+    Images are numbered in the order of their ids, which is also the order of the observations; within an image they go
+    by the ids of the points. Where an image observes a point twice, the first observation counts.
+    """
+    rows = [np.zeros((3, 0), np.int64)]
+    for number, image_id in enumerate(sorted(model.reg_image_ids())):
+        image = model.image(image_id)
+        point = np.array([seen.point3D_id for seen in image.get_observation_points2D()], np.int64)
+        keypoint = np.array(image.get_observation_point2D_idxs(), np.int64)
+        point, first = np.unique(point, return_index=True)
+        rows.append(np.stack([point, np.full(len(point), number), keypoint[first]]))
+    point, number, keypoint = np.concatenate(rows, axis=1)
+    return point, number, keypoint
+
+
+def read_tracks(model: pycolmap.Reconstruction) -> Tracks:
+    """The tracks of a model's points, in the order of their ids; images are numbered in the order of their ids."""
+    return build_tracks(*list_observations(model))
+
+
+def count_neighbours(tracks: Tracks, num_images: int) -> np.ndarray:
+    """(num_images,) int64: with how many others each image shares a track."""
+    image = tracks.image_index
+    track = np.repeat(np.arange(len(tracks)), np.diff(tracks.offsets))
+    shared = np.zeros((num_images, num_images), bool)
+    first = np.arange(len(track))
+    step = 0
+    # Observations that lie `step` apart in one track: there are fewer with each step.
+    while len(first):
+        step += 1
+        first = first[first + step < len(track)]
+        first = first[track[first] == track[first + step]]
+        shared[image[first], image[first + step]] = True
+    return (shared | shared.T).sum(axis=1)

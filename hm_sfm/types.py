@@ -39,6 +39,8 @@ class ImageRef:
     """Stored size, px, before any EXIF rotation."""
     rotation_deg: int = 0
     """Clockwise turn (0, 90, 180, 270) that EXIF asks for to show the photo upright."""
+    gps: tuple[float, float, float] | None = None
+    """Latitude and longitude in degrees (WGS84) and altitude in m, as EXIF has them."""
 
     def __post_init__(self) -> None:
         if self.rotation_deg not in (0, 90, 180, 270):

@@ -18,11 +18,11 @@ from hm_sfm.database import make_cameras, write_database
 from hm_sfm.evaluation import read_strecha_cameras, score_model
 from hm_sfm.images import list_images
 from hm_sfm.loftr_style import make_keypoints
-from hm_sfm.mapping import map_incrementally, summarise_models, verify_database, verify_pairs
+from hm_sfm.mapping import map_incrementally, summarise_models
 from hm_sfm.matching import match_pairs
-from hm_sfm.pairs import select_pairs
-from hm_sfm.reconstruction import carry_keypoints, claim_folder, describe_matching, measure_units
+from hm_sfm.reconstruction import carry_keypoints, choose_pairs, claim_folder, describe_matching, measure_units
 from hm_sfm.store import MatchStore, digest_image
+from hm_sfm.verification import verify_database, verify_pairs
 
 
 def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:
@@ -30,7 +30,7 @@ def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:
     checks = config.verification
     claim_folder(out)
     images = list_images(photos).images
-    pairs = select_pairs([image.name for image in images], config.pairs)
+    pairs = choose_pairs(images, out, config)
     cameras = make_cameras(images, config.cameras)
     px_per_unit = measure_units(images, config)
 

@@ -7,8 +7,8 @@
 
 SCENES holds a folder of photos a scene; NAME limits the run to some of them. The teachers are COLMAP's SIFT on all
 pairs, and ALIKED + LightGlue on those neighbours and overlapping pairs that SIFT matches poorly; their matches
-together are verified and mapped. Leaves OUT/<scene>/sparse/0 ... and OUT/<scene>/tracks.h5, which hm_sfm/training/multiview.py
-reads. Scenes that are there already are left alone, so an interrupted run goes on.
+together are verified and mapped. Leaves OUT/<scene>/sparse/0 ... and OUT/<scene>/tracks.h5, which
+hm_sfm/training/multiview.py reads. Scenes that are there already are left alone, so an interrupted run goes on.
 """
 
 import sys
@@ -26,9 +26,10 @@ from tqdm import tqdm
 from hm_sfm.config import CameraConfig, MappingConfig
 from hm_sfm.database import make_cameras, write_database
 from hm_sfm.images import list_images
-from hm_sfm.mapping import map_incrementally, verify_database
+from hm_sfm.mapping import map_incrementally
 from hm_sfm.training.multiview import write_tracks
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
+from hm_sfm.verification import verify_database
 
 SIFT_FEATURES = 2048
 ALIKED_KEYPOINTS = 1024

@@ -11,11 +11,11 @@ from pathlib import Path
 from hm_sfm.config import Config
 from hm_sfm.database import make_cameras, write_database
 from hm_sfm.images import list_images
-from hm_sfm.mapping import map_incrementally, summarise_models, verify_database, verify_pairs
+from hm_sfm.mapping import map_incrementally, summarise_models
 from hm_sfm.matching import match_pairs
 from hm_sfm.network.model import HomoMatcher
-from hm_sfm.pairs import select_pairs
-from hm_sfm.reconstruction import carry_keypoints, claim_folder, measure_units, open_store
+from hm_sfm.reconstruction import carry_keypoints, choose_pairs, claim_folder, measure_units, open_store
+from hm_sfm.verification import verify_database, verify_pairs
 
 
 def reconstruct_folder(photos: Path, out: Path) -> None:
@@ -25,7 +25,7 @@ def reconstruct_folder(photos: Path, out: Path) -> None:
 
     # What there is, and which images to match with which.
     images = list_images(photos).images
-    pairs = select_pairs([image.name for image in images], config.pairs)
+    pairs = choose_pairs(images, out, config)
     cameras = make_cameras(images, config.cameras)
 
     # Dense matches, each with the homography of its patch.

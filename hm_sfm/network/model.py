@@ -136,6 +136,16 @@ class HomoMatcher:
         )
 
     @torch.inference_mode()
+    def encode_plain(self, image: PreparedImage) -> Tensor:
+        """(N, C) float32 of unit length: the 1/8 cells as the backbone sees them, without what only matching needs."""
+        backbone = self.net.backbone
+        pixels = pad_image(torch.tensor(image.grey, device=self.device), backbone.stride, backbone.standardised)
+        with autocast(self.device):
+            coarse = backbone(pixels, want_fine=False).coarse
+        columns, rows = (count_cells(size, backbone.coarse_grid) for size in image.scaled_wh)
+        return F.normalize(coarse[0, :, :rows, :columns].flatten(1).T.float(), dim=1)
+
+    @torch.inference_mode()
     def match_features(self, features0: ImageFeatures, features1: ImageFeatures) -> PatchMatches:
         """Match two images by their features; coordinates are px of the stored images."""
         backbone, head = self.net.backbone, self.net.head

@@ -1,4 +1,4 @@
-"""What a batch of training pairs says about the network: the losses of its stages, and how it does on held-out pairs."""
+"""What a batch of training pairs says about the network: the losses of its stages, and how it does on kept pairs."""
 
 import dataclasses
 from collections.abc import Iterable

@@ -165,7 +165,7 @@ def find_shown(b_from_a: np.ndarray, size_wh: tuple[int, int]) -> np.ndarray:
 
 
 def disturb_view(view: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Another camera, another light: contrast, gamma, shading, blur, noise, JPEG. (H, W) float32 in [0, 255] -> uint8."""
+    """Another camera, another light: contrast, gamma, shade, blur, noise, JPEG. (H, W) float32 in [0, 255] -> uint8."""
     # Plain floats leave the array in float32.
     x = np.clip(view / 255, 0, 1) ** float(np.exp(rng.uniform(-0.45, 0.45)))
     x = (x - 0.5) * float(rng.uniform(0.6, 1.3)) + float(0.5 + rng.uniform(-0.15, 0.15))

@@ -5,11 +5,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
 from hm_sfm.config import CameraConfig
 from hm_sfm.database import Cameras, make_cameras, open_database, write_database
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.exif import write_jpeg
+from hm_sfm.images import list_images
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 
@@ -168,6 +170,130 @@ def test_unreadable_image_is_named(tmp_path):
 
 def test_no_images_need_no_cameras():
     assert make_cameras([], CameraConfig()) == Cameras((), ())
+
+
+# Cameras of a COLMAP model
+
+
+def write_known_model(folder: Path, sizes_wh: dict[str, tuple[int, int]], kind: str = "bin") -> Path:
+    """One camera per size, its ids not those of a database, and poses that say which image they are of."""
+    model = pycolmap.Reconstruction()
+    camera_ids: dict[tuple[int, int], int] = {}
+    for number, (name, size_wh) in enumerate(sizes_wh.items()):
+        if size_wh not in camera_ids:
+            camera_ids[size_wh] = 70 - len(camera_ids)
+            camera = pycolmap.Camera.create_from_model_name(camera_ids[size_wh], "OPENCV", 50.0 + number, *size_wh)
+            model.add_camera_with_trivial_rig(camera)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), [number, 0.0, 0.0])
+        image = pycolmap.Image(name=name, camera_id=camera_ids[size_wh], image_id=100 + number)
+        model.add_image_with_trivial_frame(image, pose)
+    folder.mkdir()
+    (model.write_text if kind == "txt" else model.write_binary)(folder)
+    return folder
+
+
+SIZES_WH = {"not asked.jpg": (80, 80), "b.jpg": (60, 40), "x/ab.jpg": (40, 60), "c.jpg": (60, 40)}
+
+
+@pytest.fixture
+def known_photos(tmp_path) -> list[ImageRef]:
+    return [make_photo(tmp_path, name, 28.0, SIZES_WH[name]) for name in ("b.jpg", "c.jpg", "x/ab.jpg")]
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+@pytest.mark.parametrize("whole", [True, False], ids=["folder", "cameras-file-without-points"])
+@pytest.mark.parametrize("key", ["file", "poses"])
+def test_known_cameras_go_by_the_names_of_the_images(tmp_path, known_photos, kind, whole, key):
+    path = write_known_model(tmp_path / "model", SIZES_WH, kind)
+    if not whole:
+        for part in ("points3D", "rigs", "frames"):
+            (path / f"{part}.{kind}").unlink()
+        path = path / f"cameras.{kind}"
+    cameras = make_cameras(known_photos, CameraConfig(**{key: str(path)}))
+    assert cameras.known and cameras.camera_index == (0, 0, 1)
+    assert [camera.camera_id for camera in cameras.cameras] == [1, 2]
+    assert [camera.model_name for camera in cameras.cameras] == ["OPENCV"] * 2
+    assert [camera.focal_length_x for camera in cameras.cameras] == [51.0, 52.0]
+    assert all(camera.has_prior_focal_length for camera in cameras.cameras)
+    shifts = [pose.translation[0] for pose in cameras.cam_from_world]
+    assert shifts == ([1, 3, 2] if key == "poses" else [])
+
+
+def test_photos_that_the_model_does_not_know(tmp_path, known_photos):
+    model = write_known_model(tmp_path / "model", {"b.jpg": (60, 40), "B.jpg": (60, 40), "x-ab.jpg": (40, 60)})
+    with pytest.raises(InputError, match=r"model lacks 2 of 3 photos, for example 'c.jpg', 'x/ab.jpg'; it has 3, .*'B"):
+        make_cameras(known_photos, CameraConfig(file=str(model)))
+
+
+def test_names_with_spaces_in_text_files(tmp_path):
+    photo = make_photo(tmp_path, "a b.jpg")
+    binary = write_known_model(tmp_path / "bin", {"a b.jpg": (60, 40)})
+    assert make_cameras([photo], CameraConfig(file=str(binary))).known
+    text = write_known_model(tmp_path / "txt", {"a b.jpg": (60, 40)}, "txt")
+    with pytest.raises(InputError, match="cannot read names with spaces from text files"):
+        make_cameras([photo], CameraConfig(file=str(text)))
+
+
+def test_a_model_of_photos_of_another_size(tmp_path, known_photos):
+    model = write_known_model(tmp_path / "model", {**SIZES_WH, "c.jpg": (600, 400)})
+    with pytest.raises(InputError, match=r"camera of 'c.jpg' .*model is of 600 x 400 px, the photo is 60 x 40 px"):
+        make_cameras(known_photos, CameraConfig(poses=str(model)))
+
+
+@pytest.mark.parametrize("content", [{}, {"cameras.txt": b""}, {"images.bin": b"", "cameras.txt": b""}])
+def test_no_model(tmp_path, known_photos, content):
+    (tmp_path / "model").mkdir()
+    for name, data in content.items():
+        (tmp_path / "model" / name).write_bytes(data)
+    with pytest.raises(InputError, match="model holds no COLMAP model: it lacks cameras.txt and images.txt"):
+        make_cameras(known_photos, CameraConfig(file=str(tmp_path / "model")))
+    with pytest.raises(InputError, match="none does not exist"):
+        make_cameras(known_photos, CameraConfig(file=str(tmp_path / "none")))
+    with pytest.raises(InputError, match="b.jpg is neither a folder nor named cameras.txt"):
+        make_cameras(known_photos, CameraConfig(file=str(tmp_path / "b.jpg")))
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+@pytest.mark.parametrize("part", ["cameras", "images"])
+def test_a_damaged_model(tmp_path, known_photos, capfd, kind, part):
+    model = write_known_model(tmp_path / "model", SIZES_WH, kind)
+    file = model / f"{part}.{kind}"
+    file.write_bytes(b"1 FISH what 7\n" if kind == "txt" else file.read_bytes()[:20])
+    with pytest.raises(InputError, match="the COLMAP model .*model is damaged"):
+        make_cameras(known_photos, CameraConfig(file=str(model)))
+    assert capfd.readouterr().err == ""
+
+
+def test_intrinsics_that_are_given_twice(known_photos):
+    with pytest.raises(ConfigError, match="cameras.params and cameras.poses both give the intrinsics"):
+        make_cameras(known_photos, CameraConfig(params="1,2,3,4", poses="model"))
+
+
+# Positions from EXIF
+
+
+def write_gps(path: Path, latitude: tuple, longitude: tuple, altitude: float | None) -> None:
+    """A JPEG with the position as cameras write it: degrees, minutes, seconds; south and west."""
+    exif = Image.Exif()
+    exif[0x8825] = {1: "S", 2: latitude, 3: "W", 4: longitude} | ({5: b"\0", 6: altitude} if altitude else {})
+    Image.fromarray(np.full((40, 60, 3), 128, np.uint8)).save(path, exif=exif)
+
+
+def test_gps_becomes_a_pose_prior_and_zeros_do_not(tmp_path):
+    write_gps(tmp_path / "a.jpg", (33.0, 30.0, 36.0), (70.0, 45.0, 0.0), 512.5)
+    write_gps(tmp_path / "no fix.jpg", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 12.0)
+    write_gps(tmp_path / "no altitude.jpg", (33.0, 30.0, 36.0), (70.0, 45.0, 0.0), None)
+    make_photo(tmp_path, "none.jpg")
+    images = list_images(tmp_path).images
+    keypoints = [make_keypoints(image.name, 2) for image in images]
+    write_database(tmp_path / "d.db", images, make_cameras(images, CameraConfig(mode="single")), keypoints, [])
+    with pycolmap.Database.open(tmp_path / "d.db") as database:
+        (prior,) = database.read_all_pose_priors()
+    assert prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84
+    np.testing.assert_allclose(prior.position.ravel(), [-33.51, -70.75, 512.5], atol=1e-4)
+    assert prior.has_position() and not prior.has_position_cov()
+    assert images[prior.corr_data_id.id - 1].name == "a.jpg"
+    assert prior.corr_data_id.sensor_id.type == pycolmap.SensorType.CAMERA
 
 
 # Database

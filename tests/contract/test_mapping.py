@@ -10,17 +10,11 @@ import pytest
 
 from hm_sfm.config import MappingConfig, VerificationConfig
 from hm_sfm.database import Cameras, open_database, write_database
-from hm_sfm.errors import InputError
+from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.hloc import read_features, read_matches, write_features, write_matches
-from hm_sfm.mapping import (
-    is_convincing,
-    map_incrementally,
-    summarise_models,
-    verify_database,
-    verify_pair,
-    verify_pairs,
-)
+from hm_sfm.mapping import choose_mapper, map_globally, map_images, map_incrementally, summarise_models
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, PairMatches
+from hm_sfm.verification import is_convincing, verify_database, verify_pair, verify_pairs
 
 
 @dataclass(frozen=True)
@@ -198,6 +192,102 @@ def test_missing_database_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="missing.db"):
         map_incrementally(tmp_path / "missing.db", tmp_path, tmp_path / "sparse", MappingConfig(), False)
     assert not list(tmp_path.iterdir())
+
+
+# Other mappers
+
+
+def read_geometry(path: Path) -> tuple[list, list]:
+    """The cameras of a database, and the kinds of its two-view geometries."""
+    with open_database(path) as database:
+        cameras = [camera.params.tolist() for camera in database.read_all_cameras()]
+        return cameras, [geometry.config for geometry in database.read_two_view_geometries()[1]]
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["known-intrinsics", "unknown-intrinsics"])
+def test_the_global_mapper_builds_the_oracle(tmp_path, oracle, known, capfd):
+    camera = make_known_camera(oracle) if known else make_unknown_camera(oracle)
+    path = write_and_verify(tmp_path, oracle, camera)
+    before = read_geometry(path)
+    (tmp_path / "sparse" / "3").mkdir(parents=True)  # of an earlier run
+    registered = []
+    config = MappingConfig(mapper="global")
+    cameras = Cameras((camera,), (0,) * 6, known=known)
+    capfd.readouterr()
+    models = map_images(
+        path, tmp_path, tmp_path / "sparse", oracle.images, cameras, config, lambda: registered.append(1)
+    )
+    assert capfd.readouterr().err == ""
+    assert read_geometry(path) == before
+    assert len(models) == 1 and len(registered) == 6
+    assert_same_up_to_similarity(models[0], oracle.model)
+    params = models[0].cameras[1].params
+    if known:
+        np.testing.assert_array_equal(params, camera.params)
+    np.testing.assert_allclose(params, next(iter(oracle.model.cameras.values())).params, rtol=1e-3)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["database.db", "sparse"]
+    assert [folder.name for folder in (tmp_path / "sparse").iterdir()] == ["0"]
+    assert pycolmap.Reconstruction(tmp_path / "sparse" / "0").num_points3D() == models[0].num_points3D() >= 140
+
+
+def test_the_global_mapper_without_matches_gives_no_model(tmp_path, oracle):
+    path = tmp_path / "database.db"
+    write_database(path, oracle.images, Cameras((make_known_camera(oracle),), (0,) * 6), oracle.keypoints, [])
+    assert map_globally(path, tmp_path, tmp_path / "sparse", MappingConfig(), False) == ()
+    assert not (tmp_path / "sparse").exists()
+
+
+def make_posed_cameras(oracle: Oracle) -> Cameras:
+    poses = {image.name: image.cam_from_world() for image in oracle.model.images.values()}
+    names = [image.name.removeprefix("posed/") for image in oracle.images]
+    return Cameras(
+        (make_known_camera(oracle),), (0,) * len(names), known=True, cam_from_world=tuple(poses[name] for name in names)
+    )
+
+
+def test_known_poses_are_kept_and_points_triangulated(tmp_path):
+    oracle = make_oracle(tmp_path, num_images=6, num_points=150, prefix="posed/", seed=4)
+    cameras = make_posed_cameras(oracle)
+    # The last image has no match: it keeps its pose.
+    lonely = oracle.images[-1].name
+    matches = [some for some in oracle.matches if lonely not in (some.pair.name0, some.pair.name1)]
+    path = write_and_verify(
+        tmp_path, Oracle(oracle.model, oracle.images, oracle.keypoints, matches), cameras.cameras[0]
+    )
+    config = MappingConfig(mapper="global")  # has nothing to say
+    registered = []
+    sparse = tmp_path / "sparse"
+    models = map_images(path, tmp_path, sparse, oracle.images, cameras, config, lambda: registered.append(1))
+    assert len(models) == 1 and len(registered) == 6
+    stored = pycolmap.Reconstruction(sparse / "0")
+    assert {image.name for image in stored.images.values()} == {image.name for image in oracle.images}
+    for image in stored.images.values():
+        expected = cameras.cam_from_world[image.image_id - 1].matrix()
+        np.testing.assert_allclose(image.cam_from_world().matrix(), expected, atol=1e-12)
+    np.testing.assert_array_equal(stored.cameras[1].params, cameras.cameras[0].params)
+    assert stored.num_points3D() >= 140
+    truth = np.array([point.xyz for point in oracle.model.points3D.values()])
+    found = np.array([point.xyz for point in stored.points3D.values()])
+    distance = np.linalg.norm(found[:, None] - truth[None], axis=2).min(axis=1)
+    assert np.quantile(distance, 0.9) < 1e-3
+
+
+def test_wrong_poses_give_no_model(tmp_path, oracle):
+    cameras = make_posed_cameras(oracle)
+    backwards = tuple(
+        pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, np.pi * number / 3, 0.0])), [9.0 * number, 5, 0])
+        for number in range(6)
+    )
+    wrong = Cameras(cameras.cameras, cameras.camera_index, known=True, cam_from_world=backwards)
+    path = write_and_verify(tmp_path, oracle, cameras.cameras[0])
+    models = map_images(path, tmp_path, tmp_path / "sparse", oracle.images, wrong, MappingConfig())
+    assert sum(model.num_points3D() for model in models) < 30
+    assert bool(models) == (tmp_path / "sparse").exists()
+
+
+def test_a_mapper_that_does_not_exist():
+    with pytest.raises(ConfigError, match="mapping.mapper must be incremental or global, found 'hierarchical'"):
+        choose_mapper(MappingConfig(mapper="hierarchical"))
 
 
 def test_verification_replaces_earlier_geometries_and_drops_planted_outliers(tmp_path, oracle):

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ import pytest
 from hm_sfm.cli import main
 from hm_sfm.demo import write_demo
 from hm_sfm.network.model import HomoMatcher, HomoNet, load_weights, save_weights
+from hm_sfm.textures import make_texture
 from hm_sfm.types import PinholeView
 
 
@@ -148,3 +150,14 @@ def digest_files() -> Callable[[Path], dict[str, str]]:
         return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
     return digest
+
+
+@pytest.fixture(scope="session")
+def tiny_photos(tmp_path_factory) -> Path:
+    """Six photos of 96 x 64 px that overlap: 15 pairs, matched in a moment."""
+    folder = tmp_path_factory.mktemp("tiny")
+    texture = make_texture(np.random.default_rng(4), "mural", (2.0, 1.0), 100)
+    for number in range(6):
+        crop = texture[4 + number : 68 + number, 6 * number : 6 * number + 96]
+        cv2.imwrite(str(folder / f"{number}.png"), crop)
+    return folder

@@ -176,7 +176,7 @@ def test_a_bad_pairs_file(lines, parts, scene, tmp_path, run):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("mode", ["nearest", "retrieval"])
+@pytest.mark.parametrize("mode", ["nearest", "sequental"])
 def test_a_pairs_mode_that_does_not_exist(mode, scene, tmp_path, run):
     assert_refused(run("match", scene.images, tmp_path / "out", "--pairs", mode), repr(mode))
 

@@ -18,7 +18,7 @@ from hm_sfm.cli import main, make_parser
 from hm_sfm.evaluation import write_strecha_cameras
 from hm_sfm.network.backbone import XFeatTrunk
 
-COMMANDS = ("reconstruct", "match", "export", "compare", "demo", "evaluate", "train")
+COMMANDS = ("reconstruct", "match", "export", "merge", "compare", "show", "convert", "demo", "evaluate", "train")
 
 
 def test_the_installed_command_is_main():
@@ -75,6 +75,18 @@ def test_match_stops_after_the_matches(scene, tmp_path, run, read_matches):
     matches = read_matches(out / "matches.h5")
     assert matches.keys() == {("view_00.jpg", "view_01.jpg"), ("view_01.jpg", "view_02.jpg")}
     assert all(len(fields["score"]) > 100 for fields in matches.values())
+
+
+def test_match_pairs_by_their_looks(scene, tmp_path, run, read_matches, matched_pairs):
+    command = ("match", scene.images, tmp_path / "out", "--pairs", "retrieval", "--set", "pairs.retrieval_top=1")
+    finished = run(*command)
+    assert finished.code == 0 and "retrieval: 100%" in finished.err
+    pairs = read_matches(tmp_path / "out" / "matches.h5").keys()
+    assert 3 <= len(pairs) == len(matched_pairs) <= 5
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {".hm_sfm", "retrieval", "pairs.txt", "matches.h5"}
+    again = run(*command)
+    assert again.code == 0 and "retrieval:" not in again.err
+    assert len(matched_pairs) == len(pairs)
 
 
 def test_quiet_prints_no_progress_and_no_warnings(scene, tmp_path, spawn):

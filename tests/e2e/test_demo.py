@@ -80,9 +80,11 @@ def test_demo_leaves_the_files_that_other_programs_rely_on(demo, read_matches):
     assert model.num_points3D() == summary["points"]
     assert model.compute_num_observations() == summary["observations"]
     assert summary.keys() == {
+        "image_folder",
         "num_images",
         "skipped_images",
         "registered",
+        "unregistered",
         "models",
         "points",
         "observations",

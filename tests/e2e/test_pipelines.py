@@ -19,6 +19,7 @@ from hm_sfm.training import loop
 PIPELINES = Path(__file__).parents[2] / "pipelines"
 OTHERS = {
     "benchmark_poses.py", "benchmark_scenes.py", "make_teacher_tracks.py", "peers.py", "scene_scores.py", "tables.py",
+    "benchmark.py", "matching_costs.py",
     "ablation_scores.py",
 }  # fmt: skip
 """They compare with, or learn from, packages that hm_sfm does not need; test_benchmarks.py runs what it can of them.
@@ -41,6 +42,7 @@ def test_recipes_are_short_and_all_are_run_here():
     recipes = sorted(path for path in PIPELINES.glob("*.py") if path.name not in OTHERS)
     assert [path.name for path in recipes] == [
         "ablate.py",
+        "benchmark_retrieval.py",
         "compare_tracks.py",
         "export_to_colmap.py",
         "hloc_style_steps.py",
@@ -65,6 +67,20 @@ def test_export_to_colmap(scene, out, run_recipe, matched_pairs):
     assert "of 10 image pairs verified" in printed
     assert f"{out / 'colmap' / '0'}: 5 images" in printed
     assert pycolmap.Reconstruction(out / "colmap" / "0").num_reg_images() == 5
+
+
+def test_benchmark_retrieval(scene, reconstructed, tmp_path, run_recipe, monkeypatch):
+    monkeypatch.syspath_prepend(PIPELINES)
+    models = tmp_path / "models"
+    shutil.copytree(reconstructed / "sparse", models / scene.images.name / "sparse")
+    more = ("--models", models, "--out", tmp_path / "out", "--top", "1", "4")
+    header, row = run_recipe("benchmark_retrieval.py", scene.images, *more).splitlines()
+    assert header.split() == ["scene", "among", "images", "true", "recall@1", "pairs@1", "recall@4", "pairs@4"]
+    values = row.split()
+    assert values[:3] == ["images", "itself", "5"] and 4 <= int(values[3]) <= 10
+    # Four of four others are all pairs; the best one of each makes three to five.
+    assert values[-2:] == ["100.00", "100.00"]
+    assert 30 <= float(values[5]) <= 50 and 0 < float(values[4]) < 100
 
 
 def test_hloc_style_steps(scene, out, run_recipe, matched_pairs):

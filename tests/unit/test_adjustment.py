@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from hm_sfm.adjustment import adjust_keypoints, measure_residuals, predict_targets
+from hm_sfm.config import KeypointConfig
+
+ROUNDS = KeypointConfig().adjustment_rounds
 
 
 def make_links(truth, source, target, jacobian, xy, predicted_noise=0.0, rng=None):
@@ -23,7 +26,7 @@ def test_agreeing_links_move_nothing():
     source, target = all_links(6)
     jacobian = np.eye(2) + rng.uniform(-0.3, 0.3, (len(source), 2, 2))
     predicted = make_links(truth, source, target, jacobian, truth)
-    moved, sigma = adjust_keypoints(truth, source, target, predicted, jacobian, np.ones(len(source)))
+    moved, sigma = adjust_keypoints(truth, source, target, predicted, jacobian, np.ones(len(source)), ROUNDS)
     np.testing.assert_allclose(moved, truth, atol=1e-9)
     assert sigma.shape == (6,) and (sigma >= 0).all()
     np.testing.assert_allclose(measure_residuals(truth, moved, source, target, predicted, jacobian), 0, atol=1e-9)
@@ -42,7 +45,7 @@ def test_a_misplaced_keypoint_returns_where_its_links_agree(backward):
     jacobian = np.tile(np.array([[1.2, 0.1], [-0.2, 0.9]]), (len(source), 1, 1))
     # Links are told at the first positions: exact ones do not hold where xy is off.
     predicted = make_links(truth, source, target, jacobian, xy)
-    moved, _ = adjust_keypoints(xy, source, target, predicted, jacobian, np.ones(len(source)))
+    moved, _ = adjust_keypoints(xy, source, target, predicted, jacobian, np.ones(len(source)), ROUNDS)
     assert np.linalg.norm(xy[8] - truth[8]) > 0.7
     assert np.linalg.norm(moved[8] - truth[8]) < 0.06
     assert np.linalg.norm(moved[:8] - truth[:8], axis=1).max() < 0.05
@@ -58,7 +61,7 @@ def test_averaging_reduces_noise():
     jacobian = np.eye(2) + rng.uniform(-0.1, 0.1, (len(source), 2, 2))
     xy = truth + rng.normal(0, noise, truth.shape)
     predicted = make_links(truth, source, target, jacobian, xy, noise, rng)
-    moved, sigma = adjust_keypoints(xy, source, target, predicted, jacobian, np.ones(len(source)))
+    moved, sigma = adjust_keypoints(xy, source, target, predicted, jacobian, np.ones(len(source)), ROUNDS)
 
     def disagreement(positions):
         """Without the shift that all keypoints of a track share: links cannot know it."""
@@ -75,7 +78,7 @@ def test_one_outlier_has_little_effect():
     jacobian = np.tile(np.eye(2), (len(source), 1, 1))
     predicted = make_links(truth, source, target, jacobian, truth)
     predicted[4] += (8.0, -6.0)
-    moved, _ = adjust_keypoints(truth, source, target, predicted, jacobian, np.ones(len(source)))
+    moved, _ = adjust_keypoints(truth, source, target, predicted, jacobian, np.ones(len(source)), ROUNDS)
     assert np.linalg.norm(moved - truth, axis=1).max() < 0.05
     residual = measure_residuals(truth, moved, source, target, predicted, jacobian)
     assert residual[4] > 9 and np.delete(residual, 4).max() < 0.05
@@ -86,22 +89,34 @@ def test_a_heavier_link_counts_more():
     source, target = np.array([0, 1]), np.array([2, 2])
     predicted = np.array([[0.3, 0.0], [-0.3, 0.0]])
     jacobian = np.tile(np.eye(2), (2, 1, 1))
-    moved, _ = adjust_keypoints(xy, source, target, predicted, jacobian, np.array([1.0, 0.2]))
+    moved, _ = adjust_keypoints(xy, source, target, predicted, jacobian, np.array([1.0, 0.2]), ROUNDS)
     assert moved[2, 0] > 0.01
 
 
 def test_keypoints_without_links_stay():
     xy = np.array([[3.0, 4.0], [5.0, 6.0]])
     none = np.zeros(0, np.int64)
-    moved, sigma = adjust_keypoints(xy, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
+    moved, sigma = adjust_keypoints(xy, none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), ROUNDS)
     np.testing.assert_allclose(moved, xy)
     assert np.isfinite(sigma).all()
 
 
 def test_nothing_to_adjust():
     none = np.zeros(0, np.int64)
-    moved, sigma = adjust_keypoints(np.zeros((0, 2)), none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
+    no_points, no_matrices = np.zeros((0, 2)), np.zeros((0, 2, 2))
+    moved, sigma = adjust_keypoints(no_points, none, none, no_points, no_matrices, np.zeros(0), ROUNDS)
     assert moved.shape == (0, 2) and sigma.shape == (0,)
+
+
+def test_without_rounds_keypoints_stay_and_their_uncertainty_is_told():
+    truth = np.random.default_rng(0).uniform(0, 100, (6, 2))
+    xy = truth + [[0.4, 0.0], *[[0.0, 0.0]] * 5]
+    source, target = all_links(6)
+    jacobian = np.tile(np.eye(2), (len(source), 1, 1))
+    predicted = make_links(truth, source, target, jacobian, xy)
+    moved, sigma = adjust_keypoints(xy, source, target, predicted, jacobian, np.ones(len(source)), 0)
+    np.testing.assert_array_equal(moved, xy)
+    assert sigma.argmax() == 0
 
 
 def test_a_prediction_moves_with_its_source():

@@ -97,9 +97,9 @@ def test_negative_values_are_refused(setting):
 
 
 def test_settings_come_on_top_of_the_file(tmp_path):
-    path = write(tmp_path / "c.yaml", "pairs: {window: 7, spread: 3}")
+    path = write(tmp_path / "c.yaml", "pairs: {window: 7, loop_top: 3}")
     config = load_config(path, ("pairs.window=8", "matching.model=a=b.pt", "cameras.params='900,512,384'"))
-    assert (config.pairs.window, config.pairs.spread) == (8, 3)
+    assert (config.pairs.window, config.pairs.loop_top) == (8, 3)
     assert config.matching.model == "a=b.pt"
     assert config.cameras.params == "900,512,384"
 

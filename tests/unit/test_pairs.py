@@ -4,13 +4,14 @@ import itertools
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from hm_sfm.config import PairConfig
 from hm_sfm.errors import ConfigError, InputError
-from hm_sfm.pairs import pair_evenly, pair_exhaustively, pair_sequentially, read_pairs, select_pairs, write_pairs
+from hm_sfm.pairs import pair_exhaustively, pair_sequentially, read_pairs, select_pairs, write_pairs
 from hm_sfm.types import ImagePair
 
 counts = st.integers(2, 60)
@@ -64,29 +65,116 @@ def test_sequences_compare_numbers_as_numbers():
     assert pair_sequentially(names, 2) == pair_sequentially(names[::-1], 2)
 
 
-@given(count=counts, spread=st.integers(0, 70))
-def test_even_partners_are_as_many_as_asked_for(count, spread):
-    pairs = pair_evenly(numbered(count), spread)
-    assert len(set(pairs)) == len(pairs)
-    if spread >= count - 1:
-        assert set(pairs) == all_pairs(numbered(count))
-    partners = [sum(name in (pair.name0, pair.name1) for pair in pairs) for name in numbered(count)]
-    wanted = min(spread + (spread % 2 and count % 2), count - 1)
-    assert set(partners) == {wanted}
+class Looks:
+    """Images on a circle resemble those next to them; counts how often it is asked."""
+
+    def __init__(self, order: list[str] | None = None) -> None:
+        self.order, self.asked = order, []
+
+    def __call__(self, names: list[str], top: int, gap: int) -> np.ndarray:
+        self.asked.append((top, gap))
+        place = np.argsort([(self.order or names).index(name) for name in names])
+        found = np.full((len(names), top), -1, np.int64)
+        steps = [step for k in range(1, len(names) // 2) for step in (k, -k) if k > gap][:top]
+        for at, image in enumerate(place):
+            for column, step in enumerate(steps):
+                found[image, column] = place[(at + step) % len(names)]
+        return found
 
 
-def test_even_partners_divide_the_sequence():
-    of_first = [pair for pair in pair_evenly(numbered(110), 10) if "img0.jpg" in (pair.name0, pair.name1)]
-    assert sorted(distances(of_first)) == list(range(10, 110, 10))
+def on_circle(names: list[str], reach: int) -> set[ImagePair]:
+    return {
+        ImagePair.of(name, names[(i + k) % len(names)]) for i, name in enumerate(names) for k in range(1, reach + 1)
+    }
 
 
-def test_auto_is_exhaustive_up_to_the_limit_and_a_mixture_beyond():
-    config = PairConfig(exhaustive_limit=60, window=5, spread=10)
-    assert select_pairs(numbered(60), config) == pair_exhaustively(numbered(60))
-    pairs = select_pairs(numbered(200), config)
-    assert len(set(pairs)) == len(pairs)
-    assert set(pairs) == set(pair_sequentially(numbered(200), 5)) | set(pair_evenly(numbered(200), 10))
-    assert max(distances(pairs)) > 128
+def in_order(count: int) -> list[str]:
+    return [f"img{i}.jpg" for i in range(count)]
+
+
+def test_auto_is_exhaustive_up_to_the_limit():
+    looks = Looks()
+    assert select_pairs(numbered(60), PairConfig(exhaustive_limit=60), looks) == pair_exhaustively(numbered(60))
+    assert looks.asked == []
+
+
+def test_auto_beyond_takes_what_looks_alike_and_the_window_of_a_sequence():
+    looks = Looks()
+    pairs = select_pairs(numbered(200), PairConfig(window=5, retrieval_top=4), looks)
+    assert looks.asked == [(4, 0)] and len(set(pairs)) == len(pairs)
+    within = {ImagePair.of(f"img{i}.jpg", f"img{j}.jpg") for i in range(200) for j in range(i + 1, min(i + 6, 200))}
+    assert set(pairs) == on_circle(in_order(200), 2) | within
+
+
+def test_numbers_that_say_nothing_about_the_looks_make_no_sequence():
+    shuffled = in_order(200)
+    np.random.default_rng(0).shuffle(shuffled)
+    pairs = select_pairs(numbered(200), PairConfig(window=5, retrieval_top=4), Looks(shuffled))
+    assert set(pairs) == on_circle(shuffled, 2)
+
+
+def test_names_without_numbers_make_no_sequence():
+    words = sorted("".join(letters) for letters in itertools.product("abcdef", repeat=3))
+    assert set(select_pairs(words, PairConfig(retrieval_top=4), Looks())) == on_circle(words, 2)
+    far_apart = [f"{i * 1000}.jpg" for i in range(100)]
+    assert set(select_pairs(far_apart, PairConfig(retrieval_top=4), Looks())) == on_circle(far_apart, 2)
+
+
+def test_retrieval_takes_no_more_than_there_are():
+    looks = Looks()
+    pairs = select_pairs(numbered(6), PairConfig(mode="retrieval", retrieval_top=20), looks)
+    assert looks.asked == [(5, 0)] and set(pairs) == on_circle(in_order(6), 2)
+
+
+def test_a_pair_that_one_of_the_two_proposes_is_taken_once():
+    found = np.array([[1, 2], [0, -1], [-1, -1]])
+    pairs = select_pairs(["a", "b", "c"], PairConfig(mode="retrieval"), lambda names, top, gap: found)
+    assert pairs == (ImagePair("a", "b"), ImagePair("a", "c"))
+
+
+def test_retrieval_that_finds_nothing_is_told():
+    with pytest.raises(InputError, match="'retrieval' finds no pair among 3 images"):
+        select_pairs(["a", "b", "c"], PairConfig(mode="retrieval"), lambda names, top, gap: np.full((3, 2), -1))
+
+
+def test_a_sequence_closes_its_loops_by_looks():
+    looks = Looks()
+    pairs = select_pairs(numbered(100), PairConfig(mode="sequential", window=3, loop_top=2), looks)
+    assert looks.asked == [(2, 12)]
+    assert set(pairs) == set(pair_sequentially(numbered(100), 3)) | {
+        ImagePair.of(f"img{i}.jpg", f"img{(i + 13) % 100}.jpg") for i in range(100)
+    }
+
+
+def along_a_street(count: int, step_m: float) -> dict[str, tuple[float, float, float]]:
+    return {f"img{i}.jpg": (48.0 + i * step_m / 111_200, 8.5, 100.0 * (i % 2)) for i in range(count)}
+
+
+def test_spatial_takes_the_nearest_within_the_distance():
+    names, positions = numbered(12), along_a_street(10, 30.0)
+    config = PairConfig(mode="spatial", spatial_top=2)
+    pairs = select_pairs(names, config, None, positions)
+    assert {1} <= set(distances(pairs)) <= {1, 2}
+    assert all({pair.name0, pair.name1} <= positions.keys() for pair in pairs)
+    near = PairConfig(mode="spatial", spatial_top=9, spatial_distance_m=65.0)
+    expected = {ImagePair.of(f"img{i}.jpg", f"img{j}.jpg") for i in range(10) for j in range(i + 1, min(i + 3, 10))}
+    assert set(select_pairs(names, near, None, positions)) == expected
+
+
+def test_spatial_says_what_it_lacks(caplog):
+    with pytest.raises(InputError, match="needs photos with a GPS position in EXIF, found none in 5"):
+        select_pairs(numbered(5), PairConfig(mode="spatial"), None, {})
+    with pytest.raises(InputError, match="'spatial' finds no pair among 5 images"):
+        select_pairs(numbered(5), PairConfig(mode="spatial"), None, along_a_street(5, 1000.0))
+    select_pairs(numbered(5), PairConfig(mode="spatial"), None, along_a_street(3, 10.0))
+    assert caplog.messages[-1] == "2 of 5 photos have no GPS position in EXIF: they are in no pair"
+
+
+def test_auto_adds_neighbours_by_position():
+    positions = {f"img{i}.jpg": (48.0, 8.5, 100.0) for i in (0, 50)}
+    pairs = select_pairs(numbered(100), PairConfig(retrieval_top=2), Looks(), positions)
+    without = select_pairs(numbered(100), PairConfig(retrieval_top=2), Looks())
+    assert set(pairs) - set(without) == {ImagePair.of("img0.jpg", "img50.jpg")}
 
 
 def test_modes(tmp_path):
@@ -95,10 +183,11 @@ def test_modes(tmp_path):
     assert select_pairs(names, PairConfig(mode="sequential", window=3)) == pair_sequentially(names, 3)
     (tmp_path / "pairs.txt").write_text("img1.jpg img0.jpg\n")
     assert select_pairs(names, PairConfig(mode=str(tmp_path / "pairs.txt"))) == (ImagePair("img0.jpg", "img1.jpg"),)
-    with pytest.raises(ConfigError, match="'retrieval' does not exist yet: use"):
-        select_pairs(names, PairConfig(mode="retrieval"))
-    with pytest.raises(InputError, match="'sequental' is neither auto, exhaustive or sequential nor a file"):
+    with pytest.raises(InputError, match="'sequental' is neither auto, exhaustive, .* or spatial nor a file"):
         select_pairs(names, PairConfig(mode="sequental"))
+    for mode in ("retrieval", "auto"):
+        with pytest.raises(ValueError, match="pair 100 images by their looks, select_pairs needs find_similar"):
+            select_pairs(names, PairConfig(mode=mode))
 
 
 @pytest.mark.parametrize("names", [[], ["a.jpg"]])
@@ -111,8 +200,9 @@ def test_a_pair_needs_two_images(names, mode):
 def test_impossible_settings():
     with pytest.raises(ConfigError, match="window must be at least 1, found 0"):
         pair_sequentially(numbered(5), 0)
-    with pytest.raises(ConfigError, match="spread must not be negative, found -1"):
-        pair_evenly(numbered(5), -1)
+    for key in ("window", "retrieval_top", "spatial_top"):
+        with pytest.raises(ConfigError, match=f"pairs.{key} must be at least 1, found 0"):
+            select_pairs(numbered(5), PairConfig(**{key: 0}))
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,12 @@
-"""Files that appear whole or not at all."""
+"""Files and folders that appear whole or not at all."""
 
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from hm_sfm.errors import InputError
 
 
 @contextmanager
@@ -25,6 +28,22 @@ def replace_file(path: Path) -> Iterator[Path]:
         raise
     with suppress(OSError):  # not all file systems let a folder be flushed
         _flush(path.parent, os.O_RDONLY)
+
+
+@contextmanager
+def make_folder(target: Path) -> Iterator[Path]:
+    """Give a temporary folder beside `target`; it takes the place of `target` when the block ends well.
+
+    Raises InputError where `target` is there already, unless it is an empty folder.
+    """
+    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
+        raise InputError(f"{target} is there already and not empty: name a new folder")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as temporary:
+        folder = Path(temporary) / "made"
+        folder.mkdir()
+        yield folder
+        os.replace(folder, target)
 
 
 def _flush(path: Path, flags: int) -> None:

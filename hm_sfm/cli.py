@@ -31,6 +31,13 @@ PHOTO_OPTIONS = (
      "near each other by GPS; those of a file with two names a line; or auto, all up to 60 images and a selection "
      "beyond"),
     ("--model", "matching.model", "light|FILE", "the network's weights: bundled ones, or a file made by hm-sfm train"),
+    ("--coarse", "matching.coarse", "light|sift|lightglue|xfeat",
+     "what finds the matches that homographies are estimated for: the network itself, COLMAP's SIFT, ALIKED with "
+     "LightGlue, or XFeat*"),
+    ("--coarse-matches", "matching.coarse_matches", "FILE",
+     "take these matches from a file instead: point pairs of any matcher, or indices, as hloc writes them"),
+    ("--coarse-features", "matching.coarse_features", "FILE",
+     "the keypoints in hloc's format that the matches of --coarse-matches are indices of"),
     ("--device", "matching.device", "auto|cpu|cuda", "where the network runs; auto takes the GPU if there is one"),
     ("--camera-mode", "cameras.mode", "auto|single|per-folder|per-image",
      "which photos share one camera; auto goes by size and EXIF"),
@@ -133,10 +140,32 @@ def make_parser() -> argparse.ArgumentParser:
     add_matching_options(command)
     command.set_defaults(run=run_show)
 
+    text = "an existing COLMAP database -> OUT/database.db with refined, persistent keypoints"
+    more = "Starts from its verified matches, of SIFT or anything else. The given database stays as it is."
+    command = commands.add_parser("refine", parents=[quiet], help=text, description=f"{text}. {more}")
+    command.add_argument("database", metavar="DATABASE", type=Path, help="a COLMAP database with verified matches")
+    command.add_argument("images", metavar="IMAGES", type=Path, help="the folder of its photos")
+    command.add_argument("out", metavar="OUT", type=Path, help="a new folder, or that of an earlier refinement")
+    add_matching_options(command)
+    command.set_defaults(run=run_refine)
+
     text = "the model of a run -> the files of other programs"
     more = "Takes the largest model, OUT/sparse/0; for hloc the keypoints and matches of OUT/database.db."
     command = commands.add_parser("convert", parents=[quiet], help=text, description=f"{text}. {more}")
     add_convert_options(command)
+
+    text = "videos -> a folder of photos: the sharpest frame of each interval"
+    more = (
+        "The frames of walk.mp4 are IMAGES/walk/walk_<milliseconds>.jpg, listed in IMAGES/walk/frames.csv. Videos whose "
+        "frames are there already are left alone."
+    )
+    command = commands.add_parser("frames", parents=[quiet], help=text, description=f"{text}. {more}")
+    command.add_argument("videos", metavar="VIDEO", type=Path, nargs="+", help="a video that FFmpeg can decode")
+    command.add_argument("images", metavar="IMAGES", type=Path, help="folder of photos, which may exist")
+    text = "length of an interval (default: 1)"
+    command.add_argument("--every", metavar="SECONDS", type=float, default=1.0, help=text)
+    command.add_argument("--format", choices=("jpg", "png"), default="jpg", help="of the photos (default: jpg)")
+    command.set_defaults(run=run_frames)
 
     text = "render a small scene with known cameras, reconstruct it and print the error"
     command = commands.add_parser("demo", parents=[quiet], help=text, description=f"{text}. Needs no photos.")
@@ -322,11 +351,28 @@ def run_reconstruct(options: argparse.Namespace) -> int:
     return 0
 
 
+def run_refine(options: argparse.Namespace) -> int:
+    from hm_sfm.refinement import refine_database
+
+    config = read_config(options)
+    matched, database = refine_database(options.database, options.images, options.out, config, options.quiet)
+    print(f"{len(matched.images)} images, {len(matched.pairs)} pairs and their refined keypoints: {database}")
+    return 0
+
+
 def run_convert(options: argparse.Namespace) -> int:
     from hm_sfm.conversion import convert_run
 
     convert_run(options.out, options.to, options.target, options.images)
     print(f"{options.to}: {options.target}")
+    return 0
+
+
+def run_frames(options: argparse.Namespace) -> int:
+    from hm_sfm.frames import extract_frames
+
+    frames = extract_frames(options.videos, options.images, options.every, options.format, options.quiet)
+    print(f"{len(frames)} frames of {len(options.videos)} videos: {options.images}")
     return 0
 
 

@@ -19,6 +19,7 @@ import pycolmap
 from tqdm import tqdm
 
 from hm_sfm.atomic import replace_file
+from hm_sfm.coarse_matches import check_coarse
 from hm_sfm.config import Config, fingerprint
 from hm_sfm.database import Cameras, make_cameras, open_database, write_database
 from hm_sfm.errors import ConfigError, InputError, NoModelError
@@ -155,6 +156,7 @@ def compare(
     listed = list_images(image_folder)
     names = [image.name for image in listed.images]
     pairs = choose_pairs(listed.images, out, config, quiet)
+    check_coarse(config.matching, pairs)
     cameras = make_cameras(listed.images, config.cameras)
     masks = read_masks(listed.images, config.masks)
     choose_mapper(config.mapping)

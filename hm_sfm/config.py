@@ -74,6 +74,12 @@ class PairConfig:
 class MatchingConfig:
     model: str = "light"
     """Name of bundled weights, or a file."""
+    coarse: str = "light"
+    """What finds the matches to estimate homographies for: light (the network itself) | sift | lightglue | xfeat."""
+    coarse_matches: str = ""
+    """A file with the matches of any matcher instead, as hloc or its match_dense write them;"""
+    coarse_features: str = ""
+    """and with the keypoints that these are of, where they are indices."""
     coarse_threshold: float = 0.8
     """light: least cosine similarity of a coarse match."""
     max_matches: int = 8000

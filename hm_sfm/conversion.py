@@ -13,14 +13,13 @@ import json
 import logging
 import os
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from hm_sfm.atomic import replace_file
+from hm_sfm.atomic import make_folder, replace_file
 from hm_sfm.colmap_models import quiet_colmap, read_model
 from hm_sfm.database import open_database
 from hm_sfm.errors import InputError
@@ -47,7 +46,7 @@ def convert_run(out: Path, to: str, target: Path, image_folder: Path | None = No
     if to == "ply":
         convert_to_ply(out, target)
         return
-    with _make_folder(target) as folder:
+    with make_folder(target) as folder:
         if to == "txt":
             convert_to_txt(out, folder)
         elif to == "hloc":
@@ -209,16 +208,3 @@ def _read_result(out: Path) -> pycolmap.Reconstruction:
     if not folder.is_dir():
         raise InputError(f"{out} holds no model (sparse/0): run hm-sfm reconstruct first")
     return read_model(folder)
-
-
-@contextmanager
-def _make_folder(target: Path) -> Iterator[Path]:
-    """Give a temporary folder beside `target`; it takes the place of `target` when the block ends well."""
-    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
-        raise InputError(f"{target} is there already and not empty: name a new folder")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as temporary:
-        folder = Path(temporary) / "made"
-        folder.mkdir()
-        yield folder
-        os.replace(folder, target)

@@ -130,12 +130,12 @@ def read_matches(path: Path, pairs: Sequence[ImagePair], keypoints: Sequence[Key
         return tuple(read_pair(h5, path, pair, *found, count_of) for pair, found in zip(pairs, groups))
 
 
-def find_group(h5: h5py.File, pair: ImagePair) -> tuple[str, bool] | None:
-    """Where the file has a pair, and whether with the images in the other order."""
+def find_group(h5: h5py.File, pair: ImagePair, dataset: str = "matches0") -> tuple[str, bool] | None:
+    """Where the file has a pair with this dataset, and whether with the images in the other order."""
     for separator in SEPARATORS:
         for swapped, names in ((False, (pair.name0, pair.name1)), (True, (pair.name1, pair.name0))):
             group = name_group(*names, separator)
-            if group in h5 and "matches0" in h5[group]:
+            if group in h5 and dataset in h5[group]:
                 return group, swapped
     return None
 

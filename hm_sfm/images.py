@@ -19,6 +19,7 @@ from hm_sfm.types import ImageRef, freeze_array
 logger = logging.getLogger(__name__)
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+HEIC_EXTENSIONS = (".heic", ".heif")
 MIN_EDGE_PX = 32
 """The network's coarse cells are 8 px: below this there is nothing to match."""
 
@@ -70,7 +71,7 @@ def list_images(folder: Path) -> ImageList:
     """List the photos below `folder`, subfolders included, sorted by name; hidden files and folders are ignored.
 
     A file that is named like an image but is damaged, smaller than 32 px on a side, or unknown to COLMAP is skipped:
-    it is logged as a warning and reported in `skipped`.
+    it is logged as a warning, HEIC photos together as one, and reported in `skipped`.
 
     Raises InputError where the folder does not exist, is not a folder, or holds no usable image.
     """
@@ -80,10 +81,14 @@ def list_images(folder: Path) -> ImageList:
     relative = [path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir()]
     names = [path.as_posix() for path in relative if not any(part.startswith(".") for part in path.parts)]
     candidates = sorted(name for name in names if Path(name).suffix.lower() in EXTENSIONS)
-    if not candidates:
+    heic = sorted(name for name in names if Path(name).suffix.lower() in HEIC_EXTENSIONS)
+    if not candidates and not heic:
         kinds = ", ".join(extension[1:] for extension in EXTENSIONS)
         raise InputError(f"the image folder {folder} holds {len(names)} files but no image ({kinds})")
-    images, skipped = [], []
+    images = []
+    skipped = [(name, f"{folder / name} is HEIC, which COLMAP cannot read: convert it to JPEG") for name in heic]
+    if heic:
+        logger.warning("skipped: %s (%d such files)", skipped[0][1], len(heic))
     for name in candidates:
         try:
             images.append(read_ref(folder / name, name))
@@ -94,7 +99,7 @@ def list_images(folder: Path) -> ImageList:
         raise InputError(
             f"the image folder {folder} holds {len(skipped)} images but none can be used, for example: {skipped[0][1]}"
         )
-    return ImageList(tuple(images), tuple(skipped))
+    return ImageList(tuple(images), tuple(sorted(skipped)))
 
 
 def read_ref(path: Path, name: str | None = None) -> ImageRef:

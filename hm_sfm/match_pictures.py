@@ -42,7 +42,7 @@ class MatchPictures:
         self._draw_photos(pair.path0, pair.path1, matches, measure_epipolar_error(matches, pair))
 
     def draw_homography(self, path0: Path, path1: Path, truth: np.ndarray, matches: PatchMatches) -> None:
-        """The matches of two photos, with their errors against the homography truth (3, 3), px of photo 0 -> photo 1."""
+        """The matches of two photos, with their errors against the homography truth (3, 3), px of photo 0 -> 1."""
         true = apply_homographies(np.broadcast_to(truth, (len(matches), 3, 3)), matches.xy0)
         self._draw_photos(path0, path1, matches, np.linalg.norm(true - matches.xy1, axis=1))
 

@@ -22,8 +22,6 @@ MODES = ("auto", "exhaustive", "sequential", "retrieval", "spatial")
 MAX_NAMES_LISTED = 20
 LOOP_WINDOWS = 4
 """A sequence closes a loop where it comes back after more than so many windows."""
-LARGEST_STEP = 30
-"""Numbers in the names of neighbours in a sequence differ by no more than this."""
 
 Position = tuple[float, float, float]
 """Latitude and longitude in degrees (WGS84) and altitude in m."""
@@ -208,67 +206,13 @@ def _pair_similar(
 
 
 def _is_numbered(ordered: Sequence[str]) -> bool:
-    """Whether most names differ from the next one in nothing but a number that is a little higher there."""
+    """Whether most names differ from the next one in nothing but a number."""
     keys = [_natural_key(name)[0] for name in ordered]
     steps = [
         [(one, other) for one, other in zip(key, after) if one != other] if len(key) == len(after) else []
         for key, after in itertools.pairwise(keys)
     ]
-    numbered = [
-        len(step) == 1 and isinstance(step[0][0], int) and 0 < step[0][1] - step[0][0] <= LARGEST_STEP for step in steps
-    ]
-    return 2 * sum(numbered) > len(numbered)
-
-
-def _write_positions(database: pycolmap.Database, names: Sequence[str], positions: Mapping[str, Position]) -> None:
-    """Images 1, 2 ... with their positions, and a camera only because COLMAP wants one."""
-    camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId.SIMPLE_PINHOLE, 1.0, 1, 1)
-    with pycolmap.DatabaseTransaction(database):
-        database.write_camera(camera, use_camera_id=True)
-        for image_id, name in enumerate(names, start=1):
-            image = pycolmap.Image(name=name, camera_id=1, image_id=image_id)
-            database.write_image(image, use_image_id=True)
-            wgs84 = pycolmap.PosePriorCoordinateSystem.WGS84
-            prior = pycolmap.PosePrior(
-                corr_data_id=image.data_id, position=np.array(positions[name]), coordinate_system=wgs84
-            )
-            database.write_pose_prior(prior)
-
-
-def _pair_at_distances(ordered: Sequence[str], distances: Iterable[int]) -> tuple[ImagePair, ...]:
-    distances = tuple(distances)
-    return tuple(
-        ImagePair.of(name, ordered[i + distance])
-        for i, name in enumerate(ordered)
-        for distance in distances
-        if i + distance < len(ordered)
-    )
-
-
-def _pair_similar(
-    ordered: Sequence[str], find_similar: FindSimilar | None, top: int, gap: int = 0
-) -> tuple[ImagePair, ...]:
-    """Each image with the `top` ones most like it: a pair that one of the two proposes is enough."""
-    if find_similar is None:
-        raise ValueError(f"to pair {len(ordered)} images by their looks, select_pairs needs find_similar")
-    found = find_similar(ordered, min(top, len(ordered) - 1), gap)
-    return tuple(
-        dict.fromkeys(
-            ImagePair.of(ordered[i], ordered[j]) for i, row in enumerate(found.tolist()) for j in row if j >= 0
-        )
-    )
-
-
-def _is_numbered(ordered: Sequence[str]) -> bool:
-    """Whether most names differ from the next one in nothing but a number that is a little higher there."""
-    keys = [_natural_key(name)[0] for name in ordered]
-    steps = [
-        [(one, other) for one, other in zip(key, after) if one != other] if len(key) == len(after) else []
-        for key, after in itertools.pairwise(keys)
-    ]
-    numbered = [
-        len(step) == 1 and isinstance(step[0][0], int) and 0 < step[0][1] - step[0][0] <= LARGEST_STEP for step in steps
-    ]
+    numbered = [len(step) == 1 and isinstance(step[0][0], int) for step in steps]
     return 2 * sum(numbered) > len(numbered)
 
 

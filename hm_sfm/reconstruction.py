@@ -18,6 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from hm_sfm.atomic import replace_file
+from hm_sfm.coarse_matches import check_coarse, describe_coarse
 from hm_sfm.config import Config, fingerprint
 from hm_sfm.database import Cameras, make_cameras, write_database
 from hm_sfm.diagnosis import Diagnosis, diagnose
@@ -43,8 +44,11 @@ logger = logging.getLogger(__name__)
 
 MARKER = ".hm_sfm"
 """File by which a folder is known as the output of a run."""
-UNDESCRIBED = {("matching", key) for key in ("device", "feature_cache_mb", "model", "engine")}
-"""Settings that the matches do not depend on; the model's weights are described instead of their name."""
+UNDESCRIBED = {
+    ("matching", key)
+    for key in ("device", "feature_cache_mb", "model", "engine", "coarse", "coarse_matches", "coarse_features")
+}
+"""Settings that the matches do not depend on, and those that are described by what their names stand for."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,7 @@ def match_photos(
     images = listed.images
     check_engine(config.matching.engine)
     pairs = choose_pairs(images, out, config, quiet, shared=shard is not None)
+    check_coarse(config.matching, pairs)
     cameras = make_cameras(images, config.cameras)
     masks = read_masks(images, config.masks)  # all bad input is found before anything is computed
     choose_mapper(config.mapping)
@@ -121,16 +126,22 @@ def export_database(image_folder: Path, out: Path, config: Config, quiet: bool =
     """As match_photos, then OUT/database.db with persistent keypoints and verified matches."""
     matched = match_photos(image_folder, out, config, quiet)
     keypoints, matches = verify_and_carry(matched, config, quiet)
+    write_verified(matched, keypoints, matches, Path(out) / "database.db", config)
+    return matched
+
+
+def write_verified(
+    matched: Matched, keypoints: Sequence[Keypoints], matches: Sequence[IndexMatches], path: Path, config: Config
+) -> None:
+    """write_database, then the two-view geometries of all its pairs; adds to the seconds of `matched`."""
     with stopwatch(matched.seconds, "verify"):
-        database = Path(out) / "database.db"
-        write_database(database, matched.images, matched.cameras, keypoints, matches)
+        write_database(path, matched.images, matched.cameras, keypoints, matches)
         verify_database(
-            database,
+            path,
             config.verification.max_error_px * max(measure_units(matched.images, config).values()),
             config.verification.min_inliers,
             config.verification.min_inlier_ratio,
         )
-    return matched
 
 
 @release_locks()
@@ -148,9 +159,12 @@ def export_hloc(image_folder: Path, out: Path, config: Config, quiet: bool = Fal
 
 
 def verify_and_carry(
-    matched: Matched, config: Config, quiet: bool = False
+    matched: Matched, config: Config, quiet: bool = False, seeds: Mapping[str, np.ndarray] | None = None
 ) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
-    """Persistent keypoints from matches: verify_pairs, then carry_keypoints; adds to the seconds of `matched`."""
+    """Persistent keypoints from matches: verify_pairs, then carry_keypoints; adds to the seconds of `matched`.
+
+    seeds: as in carry_keypoints.
+    """
     images = matched.images
     cameras = {image.name: matched.cameras.cameras[i] for image, i in zip(images, matched.cameras.camera_index)}
     with stopwatch(matched.seconds, "verify"):
@@ -164,7 +178,7 @@ def verify_and_carry(
             quiet,
         )
     with stopwatch(matched.seconds, "keypoints"):
-        return carry_keypoints(images, verified, matched.store, config, quiet, matched.store.masks)
+        return carry_keypoints(images, verified, matched.store, config, quiet, matched.store.masks, seeds)
 
 
 @release_locks()
@@ -258,7 +272,7 @@ def describe_matching(config: Config) -> dict[str, object]:
         for key, value in dataclasses.asdict(getattr(config, section)).items():
             if (section, key) not in UNDESCRIBED:
                 described[f"{section}.{key}"] = value
-    return described
+    return described | describe_coarse(config.matching)
 
 
 def open_store(path: Path, images: Sequence[ImageRef], config: Config) -> MatchStore:
@@ -278,10 +292,12 @@ def carry_keypoints(
     config: Config,
     quiet: bool = False,
     masks: Masks = NO_MASKS,
+    seeds: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
     """persist_keypoints over the verified pairs, strongest first. Raises InputError on an undecodable photo.
 
-    store: what the pairs were verified with. masks: no keypoint lies in a masked pixel.
+    store: what the pairs were verified with. masks: no keypoint lies in a masked pixel. seeds: by image name, (N, 2) px
+    of the stored image, best first, the points that keypoints may be founded at; None finds them in the photos.
 
     Returns the Keypoints of every image, in the order of `images`, and the IndexMatches of the pairs that share tracks.
     """
@@ -291,7 +307,7 @@ def carry_keypoints(
             image.name,
             image.size_wh,
             px_per_unit[image.name],
-            find_seeds(prepare_image(image, config.images.long_edge_px)),
+            find_seeds(prepare_image(image, config.images.long_edge_px)) if seeds is None else seeds[image.name],
             partial(masks.hides, image.name) if image.name in masks.packed else None,
         )
         for image in tqdm(images, desc="seeds", unit="image", disable=quiet)

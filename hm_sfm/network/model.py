@@ -5,6 +5,7 @@ import hashlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from hm_sfm.atomic import replace_file
+from hm_sfm.coarse_matches import PointPairs, make_provider
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, parse_config
 from hm_sfm.coordinates import Grid
 from hm_sfm.errors import ConfigError, WeightsError
@@ -20,9 +22,9 @@ from hm_sfm.network.backbone import LightBackbone
 from hm_sfm.network.coarse import AttentionCoarse, CosineCoarse, LoftrCoarse
 from hm_sfm.network.fine import ExpectationHead, FineMap, HomographyHead, make_fine_map
 from hm_sfm.network.growth import GridMatches, PatchGrid, grow_matches
-from hm_sfm.network.homography import is_regular
+from hm_sfm.network.homography import is_regular, make_corners
 from hm_sfm.network.resnet import LoftrBackbone
-from hm_sfm.types import PatchMatches
+from hm_sfm.types import ImageRef, PatchMatches
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 FINE_CHUNK = 512
@@ -77,20 +79,53 @@ class ImageFeatures:
     scaled_wh: tuple[int, int]
     stored_from_scaled: np.ndarray
     """(3, 3) float64: px of the network's input -> px of the stored image."""
+    image: ImageRef
+    found: dict[str, Any]
+    """What the provider of coarse matches wants to know of the image, see CoarseProvider.describe."""
 
     @property
     def size_bytes(self) -> int:
         """Memory that the features take."""
-        return sum(t.numel() * t.element_size() for t in (self.coarse, self.cell, self.fine.cells))
+        found = [value for value in self.found.values() if hasattr(value, "nbytes")]
+        return sum(array.nbytes for array in (self.coarse, self.cell, self.fine.cells, *found))
+
+
+class NetworkCoarse:
+    """The coarse stage of the network itself, as a provider of coarse matches: points on the grid of its cells."""
+
+    def __init__(self, net: HomoNet, threshold: float) -> None:
+        self.net, self.threshold = net, threshold
+
+    def describe(self, image: PreparedImage) -> dict[str, Any]:
+        """Nothing: its features come with the fine ones."""
+        return {}
+
+    def match(self, features0: ImageFeatures, features1: ImageFeatures) -> PointPairs:
+        """The score is the coarse stage's confidence. A point is the fine cell nearest to its coarse cell's centre."""
+        backbone = self.net.backbone
+        with autocast(features0.coarse.device):
+            index0, index1, confidence = self.net.coarse.match(features0.coarse, features1.coarse, self.threshold)
+        xy0, xy1 = (
+            backbone.fine_grid.to_px(
+                fine_cell_of(features.cell[index], backbone.coarse_grid, backbone.fine_grid).cpu().numpy()
+            )
+            for features, index in ((features0, index0), (features1, index1))
+        )
+        return PointPairs(xy0, xy1, confidence.float().cpu().numpy(), index0=index0.cpu().numpy())
 
 
 class HomoMatcher:
-    """Matches two images: a network on a device, with the thresholds of the configuration."""
+    """Matches two images: a network on a device, with the thresholds of the configuration.
+
+    Raises ConfigError, MissingPackageError or InputError where the configuration's coarse matches cannot be had, see
+    make_provider.
+    """
 
     def __init__(self, net: HomoNet, config: MatchingConfig, images: ImageConfig) -> None:
         self.device = pick_device(config.device)
         self.net = net.to(self.device).eval().requires_grad_(False)
         self.config, self.images = config, images
+        self.provider = make_provider(config, self.device) or NetworkCoarse(self.net, config.coarse_threshold)
 
     @classmethod
     def from_pretrained(
@@ -133,6 +168,8 @@ class HomoMatcher:
             fine=make_fine_map(maps.fine),
             scaled_wh=image.scaled_wh,
             stored_from_scaled=image.stored_from_scaled,
+            image=image.ref,
+            found=self.provider.describe(image),
         )
 
     @torch.inference_mode()
@@ -149,12 +186,10 @@ class HomoMatcher:
     def match_features(self, features0: ImageFeatures, features1: ImageFeatures) -> PatchMatches:
         """Match two images by their features; coordinates are px of the stored images."""
         backbone, head = self.net.backbone, self.net.head
-        threshold = self.config.coarse_threshold
-        with autocast(self.device):
-            index0, index1, confidence = self.net.coarse.match(features0.coarse, features1.coarse, threshold)
-        best = confidence.argsort(descending=True, stable=True)[: self.config.max_matches]
-        cell0 = fine_cell_of(features0.cell[index0[best]], backbone.coarse_grid, backbone.fine_grid)
-        cell1 = fine_cell_of(features1.cell[index1[best]], backbone.coarse_grid, backbone.fine_grid)
+        coarse = self.provider.match(features0, features1).keep_best(self.config.max_matches)
+        cell0, rest0 = round_to_cells(coarse.xy0, backbone.fine_grid)
+        cell1, rest1 = round_to_cells(coarse.xy1, backbone.fine_grid)
+        cell0, cell1 = cell0.to(self.device), cell1.to(self.device)
 
         def refine(cell0: Tensor, cell1: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor]:
             homography, log_scale = [torch.zeros(0, 3, 3, device=self.device)], [torch.zeros(0, device=self.device)]
@@ -168,25 +203,33 @@ class HomoMatcher:
                 log_scale.append(estimate.log_scale)
             return torch.cat(homography), torch.cat(log_scale)
 
-        found = GridMatches(index0[best], cell1, *refine(cell0, cell1, None))
+        start = None
+        if isinstance(head, HomographyHead):
+            start = make_start(rest0, rest1, coarse.linear, head.half).to(self.device)
+        homography, log_scale = refine(cell0, cell1, start)
         good = scale_from_score(GROWING_SCORE, backbone.fine_grid)
-        count = torch.count_nonzero(found.log_scale < good)
-        if isinstance(head, HomographyHead) and count < self.config.grow_below:
+        can_grow = isinstance(head, HomographyHead) and coarse.index0 is not None
+        if can_grow and torch.count_nonzero(log_scale < good) < self.config.grow_below:
             columns, rows = (count_cells(size, backbone.coarse_grid) for size in features0.scaled_wh)
             first, second = fine_cell_of(torch.tensor([[0, 0], [1, 1]]), backbone.coarse_grid, backbone.fine_grid)
             grid = PatchGrid(columns, rows, int(first[0]), int(second[0] - first[0]), head.half)
+            found = GridMatches(torch.tensor(coarse.index0, device=self.device), cell1, homography, log_scale)
             found = grow_matches(found, grid, refine, features1.fine.size_wh, good, GROWING_ROUNDS)
-            cell0 = grid.to_fine(found.index0)
-        regular = is_regular(found.homography, head.half).cpu().numpy()
-        return self._to_stored(features0, features1, cell0, found.cell1, found.homography, found.log_scale, regular)
+            cell0, cell1 = grid.to_fine(found.index0), found.cell1
+            homography, log_scale, rest0 = found.homography, found.log_scale, np.zeros((len(cell0), 2))
+        regular = is_regular(homography, head.half).cpu().numpy()
+        return self._to_stored(features0, features1, cell0, rest0, cell1, homography, log_scale, regular)
 
-    def _to_stored(self, features0, features1, cell0, cell1, homography, log_scale, regular) -> PatchMatches:
-        """From patch coordinates to px of the stored images; drops irregular patches and those out of an image."""
+    def _to_stored(self, features0, features1, cell0, rest0, cell1, homography, log_scale, regular) -> PatchMatches:
+        """From patch coordinates to px of the stored images; drops irregular patches and those out of an image.
+
+        rest0: (P, 2) float64 cells, the matched points relative to the centres of their patches.
+        """
         grid, half = self.net.backbone.fine_grid, self.net.head.half
         stored0 = features0.stored_from_scaled @ cell_to_px(cell0.cpu().numpy(), grid)
         stored1 = features1.stored_from_scaled @ cell_to_px(cell1.cpu().numpy(), grid)
         between = stored1 @ homography.cpu().numpy().astype(np.float64) @ np.linalg.inv(stored0)
-        centre0 = stored0[:, :2, 2]
+        centre0 = stored0[:, :2, 2] + np.einsum("nij,nj->ni", stored0[:, :2, :2], rest0)
         mapped = np.einsum("nij,nj->ni", between[:, :, :2], centre0) + between[:, :, 2]
         between = between / mapped[:, 2, None, None]
         centre1 = mapped[:, :2] / mapped[:, 2:]
@@ -222,6 +265,23 @@ def count_cells(size_px: int, grid: Grid) -> int:
 def fine_cell_of(coarse_cell: Tensor, coarse_grid: Grid, fine_grid: Grid) -> Tensor:
     """(P, 2) int64 coarse cells -> (P, 2) int64: the fine cell nearest to each one's centre (halves go up)."""
     return torch.floor(fine_grid.from_px(coarse_grid.to_px(coarse_cell.double())) + 0.5).long()
+
+
+def round_to_cells(xy_px: np.ndarray, grid: Grid) -> tuple[Tensor, np.ndarray]:
+    """(P, 2) px of the network's input -> (P, 2) int64 cells nearest to them, and (P, 2) cells from these to them."""
+    position = grid.from_px(xy_px)
+    cell = np.floor(position + 0.5)
+    return torch.tensor(cell, dtype=torch.int64), position - cell
+
+
+def make_start(rest0: np.ndarray, rest1: np.ndarray, linear: np.ndarray | None, half: float) -> Tensor:
+    """(P, 4, 2) float32 cells: the displacements of the patches' corners that bring matched points together.
+
+    rest0, rest1: (P, 2) cells, the points relative to the centres of their patches; linear: (P, 2, 2), see PointPairs.
+    """
+    corners = make_corners(half).double().numpy()
+    around = np.eye(2) if linear is None else linear
+    return torch.tensor((corners - rest0[:, None]) @ np.swapaxes(around, -1, -2) + rest1[:, None] - corners).float()
 
 
 def cell_to_px(cell: np.ndarray, grid: Grid) -> np.ndarray:

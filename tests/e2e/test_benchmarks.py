@@ -14,9 +14,10 @@ import pytest
 import torch
 from PIL import Image
 
+from hm_sfm.coarse_matches import read_rgb, to_px
 from hm_sfm.config import Config, VerificationConfig
 from hm_sfm.errors import InputError
-from hm_sfm.images import prepare_image, read_ref
+from hm_sfm.images import read_ref
 from hm_sfm.pair_evaluation import PointMatches
 from hm_sfm.types import ImagePair
 
@@ -163,17 +164,16 @@ def test_keeping_one_to_one_prefers_what_comes_first(load):
 
 
 def test_peers_see_photos_as_hm_sfm_does(tmp_path, load):
-    peers = load("peers")
     pixels = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (120, 200, 3), np.uint8), (0, 0), 3)
     exif = Image.Exif()
     exif[0x0112] = 6  # to be turned by 90 degrees
     Image.fromarray(pixels).save(tmp_path / "turned.png", exif=exif)
-    rgb, stored_from_scaled = peers.read_photo(tmp_path / "turned.png", 100)
-    prepared = prepare_image(read_ref(tmp_path / "turned.png"), 100)
+    prepared = load("peers").read_photo(tmp_path / "turned.png", 100)
+    rgb = read_rgb(prepared)
     assert rgb.shape == (100, 60, 3)
     assert np.abs(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) / 255 - prepared.grey).max() < 0.01
     # The centre of the top-left pixel, seen upright, lies at the bottom left of the stored photo.
-    stored = peers.to_stored(torch.tensor([[0.0, 0.0]]), stored_from_scaled)
+    stored = load("peers").to_stored(to_px(torch.tensor([[0.0, 0.0]])), prepared.stored_from_scaled)
     assert np.allclose(stored, [[1, 119]])
 
 
@@ -182,7 +182,7 @@ class FakeLightGlue(torch.nn.Module):
 
     def forward(self, data):
         count = min(len(data[side]["keypoints"][0]) for side in ("image0", "image1"))
-        return {"matches": [torch.arange(1, count)[:, None].repeat(1, 2)]}
+        return {"matches": [torch.arange(1, count)[:, None].repeat(1, 2)], "scores": [torch.ones(count - 1)]}
 
 
 class FakeAliked(torch.nn.Module):

@@ -18,7 +18,10 @@ from hm_sfm.cli import main, make_parser
 from hm_sfm.evaluation import write_strecha_cameras
 from hm_sfm.network.backbone import XFeatTrunk
 
-COMMANDS = ("reconstruct", "match", "export", "merge", "compare", "show", "convert", "demo", "evaluate", "train")
+COMMANDS = (
+    "reconstruct", "match", "export", "merge", "compare", "show", "refine", "convert", "frames", "demo", "evaluate",
+    "train",
+)  # fmt: skip
 
 
 def test_the_installed_command_is_main():

@@ -20,10 +20,10 @@ PIPELINES = Path(__file__).parents[2] / "pipelines"
 OTHERS = {
     "benchmark_poses.py", "benchmark_scenes.py", "make_teacher_tracks.py", "peers.py", "scene_scores.py", "tables.py",
     "benchmark.py", "matching_costs.py",
-    "ablation_scores.py",
+    "ablation_scores.py", "make_api_reference.py",
 }  # fmt: skip
 """They compare with, or learn from, packages that hm_sfm does not need; test_benchmarks.py runs what it can of them.
-ablation_scores.py measures what ablate.py tells."""
+ablation_scores.py measures what ablate.py tells, and test_docs.py runs make_api_reference.py."""
 
 
 @pytest.fixture

@@ -126,6 +126,22 @@ def test_unusable_images_are_skipped_and_reported(tmp_path, caplog):
     assert all(any(reason in record.getMessage() for record in caplog.records) for _, reason in listing.skipped)
 
 
+def test_heic_photos_are_skipped_with_one_warning_that_says_what_to_do(tmp_path, caplog):
+    for name in ("IMG_2.HEIC", "sub/IMG_1.heic", "IMG_3.heif"):
+        write(tmp_path / name, b"\0\0\0\x18ftypheic")
+    with pytest.raises(InputError, match="holds 3 images but none can be used.*IMG_2.HEIC is HEIC.*convert it to JPEG"):
+        list_images(tmp_path)
+    write(tmp_path / "IMG_2.jpg", encode(textured(64, 48)))
+    caplog.clear()
+    listing = list_images(tmp_path)
+    assert [ref.name for ref in listing.images] == ["IMG_2.jpg"]
+    assert [name for name, _ in listing.skipped] == ["IMG_2.HEIC", "IMG_3.heif", "sub/IMG_1.heic"]
+    assert "convert it to JPEG" in skipped_reason(listing, "sub/IMG_1.heic")
+    (message,) = caplog.messages
+    reason = "is HEIC, which COLMAP cannot read: convert it to JPEG (3 such files)"
+    assert message == f"skipped: {tmp_path / 'IMG_2.HEIC'} {reason}"
+
+
 def test_bytes_after_the_end_of_an_image_are_accepted(tmp_path):
     image = textured(64, 48)
     write(tmp_path / "motion.jpg", with_exif(encode(image), 1, encode(image)) + b"\0" * 999 + b"a video")

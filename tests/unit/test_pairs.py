@@ -116,8 +116,13 @@ def test_numbers_that_say_nothing_about_the_looks_make_no_sequence():
 def test_names_without_numbers_make_no_sequence():
     words = sorted("".join(letters) for letters in itertools.product("abcdef", repeat=3))
     assert set(select_pairs(words, PairConfig(retrieval_top=4), Looks())) == on_circle(words, 2)
-    far_apart = [f"{i * 1000}.jpg" for i in range(100)]
-    assert set(select_pairs(far_apart, PairConfig(retrieval_top=4), Looks())) == on_circle(far_apart, 2)
+
+
+def test_frames_named_by_their_milliseconds_are_a_sequence():
+    frames = [f"walk_{i * 500:08d}.jpg" for i in range(100)]
+    pairs = select_pairs(frames, PairConfig(window=5, retrieval_top=4), Looks())
+    within = {ImagePair.of(one, other) for i, one in enumerate(frames) for other in frames[i + 1 : i + 6]}
+    assert within <= set(pairs)
 
 
 def test_retrieval_takes_no_more_than_there_are():

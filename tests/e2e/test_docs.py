@@ -1,0 +1,141 @@
+"""What the pages of docs/ say can be typed, can be typed, and what they say of the code is so."""
+
+import re
+import runpy
+import shlex
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from hm_sfm.cli import make_parser
+from hm_sfm.config import parse_config
+from hm_sfm.diagnosis import ADVICE, Cause
+from hm_sfm.errors import InputError
+from hm_sfm.training.loop import TrainConfig, check_config
+from hm_sfm.training.multiview import VALIDATION_SCENES
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = {path.name: path.read_text() for path in sorted(DOCS.glob("*.md"))}
+WRITTEN = sorted(PAGES.keys() - {"README.md", "api.md"})
+CHEAP = ("show", "convert", "frames", "export")
+"""Commands that are run here; of the others, only the arguments are checked."""
+
+
+def code_blocks(page: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", PAGES[page], re.MULTILINE | re.DOTALL)
+
+
+def list_commands(page: str) -> list[list[str]]:
+    """The arguments of each hm-sfm command of a page's blocks."""
+    lines = [line for block in code_blocks(page, "sh") for line in block.splitlines()]
+    assert all(re.match(r"hm-sfm |torchrun [^|]* -m hm_sfm\.cli ", line) for line in lines), lines
+    return [shlex.split(re.sub(r"^(hm-sfm|torchrun .*? -m hm_sfm\.cli) ", "", line)) for line in lines]
+
+
+def test_the_index_has_a_line_for_each_page():
+    linked = re.findall(r"^- \[[^]]+\]\(([\w.-]+\.md)\)", PAGES["README.md"], re.MULTILINE)
+    assert sorted(linked) == sorted(PAGES.keys() - {"README.md"})
+
+
+@pytest.mark.parametrize("page", WRITTEN)
+def test_all_commands_parse(page):
+    commands = list_commands(page)
+    assert commands
+    for command in commands:
+        make_parser().parse_args(command)
+    # Also those within a sentence.
+    for line in re.findall(r"`hm-sfm ([^`]*--[^`]*)`", PAGES[page]):
+        try:
+            make_parser().parse_args(shlex.split(line))
+        except InputError as error:
+            assert "the following arguments are required" in str(error), line
+
+
+@pytest.mark.parametrize("page", WRITTEN)
+def test_all_options_settings_and_files_are_there(page):
+    text = PAGES[page]
+    known = {
+        flag
+        for line in (ROOT / "hm_sfm" / "cli.py").read_text().splitlines()
+        for flag in re.findall(r"--[a-z-]+", line)
+    }
+    assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)) - {"--nproc-per-node", "--editable"} <= known
+    for setting in re.findall(r"--set ([\w.]+)=", text):
+        section, _, key = setting.partition(".")
+        assert key in yaml.safe_load((ROOT / "configs" / "light.yaml").read_text())[section], setting
+    for name in re.findall(r"\]\((?!https?:)([^)#]+)", text):
+        assert (DOCS / name).exists(), name
+    for name in re.findall(r"\b((?:hm_sfm|configs|pipelines)/[\w/]+\.\w+)", text):
+        assert (ROOT / name).exists(), name
+
+
+def test_the_cheap_commands_run(scene, out, tmp_path, monkeypatch, run, matched_pairs):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(scene.images, "photos")
+    out = out.rename(tmp_path / "castle")
+    Path("out").mkdir()
+    out.rename("out/castle")
+    video = cv2.VideoWriter("walk.avi", cv2.VideoWriter_fourcc(*"MJPG"), 10, (320, 240))
+    for name in sorted(path.name for path in scene.images.iterdir()):
+        video.write(cv2.imread(f"photos/{name}"))
+    video.release()
+
+    commands = [command for page in WRITTEN for command in list_commands(page) if command[0] in CHEAP]
+    assert {command[0] for command in commands} == set(CHEAP)
+    for command in commands:
+        finished = run(*command)
+        assert finished.code == 0, (command, finished.err)
+    assert len(matched_pairs) == 1  # by show; everything else was there
+    (frame,) = Path("photos/walk").glob("*.jpg")
+    assert re.fullmatch(r"walk_\d{8}\.jpg", frame.name)
+
+
+def test_the_python_example_of_hloc_runs(scene, out, tmp_path, monkeypatch, run):
+    assert run("export", scene.images, out, "--format", "hloc", "--quiet").code == 0
+    (tmp_path / "work" / "out").mkdir(parents=True)
+    out.rename(tmp_path / "work" / "out" / "castle")
+    monkeypatch.chdir(tmp_path / "work")
+    shutil.copytree(scene.images, "photos")
+    (example,) = code_blocks("from-hloc.md", "python")
+    names: dict = {}
+    exec(example, names)
+    assert names["database"].exists() and sum(map(len, names["matches"])) > 1000
+
+
+def test_the_training_configurations_are_complete():
+    blocks = code_blocks("train-on-megadepth.md", "yaml")
+    assert len(blocks) == 2
+    for block in blocks:
+        config = parse_config(yaml.safe_load(block), TrainConfig)
+        check_config(config)
+        assert config.megadepth_share > 0
+    for share in ("rendered_share", "real_share", "megadepth_share"):
+        assert f"`{share}`" in PAGES["train-on-megadepth.md"]
+    assert "`VALIDATION_SCENES`" in PAGES["train-on-megadepth.md"] and VALIDATION_SCENES
+
+
+def test_every_cause_of_a_missing_photo_is_explained():
+    page = PAGES["photos-that-do-not-register.md"]
+    rows = re.findall(r"^\| ([a-z][^|]+?) \|", page, re.MULTILINE)
+    assert rows == ["cause", *(cause.value for cause in Cause)]
+    for advice in {advice for some in ADVICE.values() for advice in some}:
+        for option in re.findall(r"--[a-z-]+ ?[\w.=-]*", advice):
+            assert option.strip().removesuffix(" and") in page, option
+
+
+def test_the_api_reference_is_up_to_date():
+    make_reference = runpy.run_path(str(ROOT / "pipelines" / "make_api_reference.py"))["make_reference"]
+    assert PAGES["api.md"] == make_reference(), "docs/api.md is old: python pipelines/make_api_reference.py"
+    for name in re.findall(r"^\| `(\w+)` \| ", PAGES["api.md"], re.MULTILINE):
+        assert f"\n### {name}\n" in PAGES["api.md"], name
+
+
+def test_the_picture_of_the_report():
+    picture = cv2.imread(str(DOCS / "report.png"))
+    assert picture.shape == (1000, 1180, 3) and np.std(picture) > 10
+    assert (DOCS / "report.png").stat().st_size < 300_000

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from hm_sfm import HomoMatcher
-from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig
+from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, load_config
 from hm_sfm.errors import ConfigError, InputError, WeightsError
 from hm_sfm.network import model
 from hm_sfm.network.model import (
@@ -204,6 +204,15 @@ def test_a_shifted_image_matches_by_its_shift(matcher):
     offset = found.xy1 - found.xy0
     assert (np.linalg.norm(offset - [-16, -8], axis=1) < 1).mean() > 0.9
     assert found.xy0.dtype == found.xy1.dtype == found.score.dtype == found.homography.dtype == np.float32
+
+
+def test_the_fast_configuration_matches_a_shifted_image():
+    config = load_config(Path(__file__).parents[2] / "configs" / "light_fast.yaml")
+    fast = HomoMatcher.from_pretrained(config.matching.model, config=config.matching, network=config.network)
+    texture = make_texture(260, 200)
+    found = fast.match(texture[:, :240], texture[:, 20:])
+    assert len(found) > 300
+    assert np.mean(np.linalg.norm(found.xy1 - (found.xy0 - [20, 0]), axis=1) < 1) > 0.9
 
 
 def test_matches_come_best_first(matcher):

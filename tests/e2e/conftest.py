@@ -1,5 +1,6 @@
 """Scenes that are rendered and reconstructed once for all end-to-end tests, and ways to run the command."""
 
+import ctypes
 import dataclasses
 import hashlib
 import shutil
@@ -62,6 +63,8 @@ def run(capfd) -> Callable[..., Finished]:
     """Run hm-sfm in this process, which saves loading PyTorch again; capfd also sees what C++ libraries print."""
 
     def run_here(*arguments: object) -> Finished:
+        # What C++ libraries printed in earlier tests may still wait in C's own buffer.
+        ctypes.CDLL(None).fflush(None)
         capfd.readouterr()
         started = time.monotonic()
         try:

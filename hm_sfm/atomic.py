@@ -46,6 +46,15 @@ def make_folder(target: Path) -> Iterator[Path]:
         os.replace(folder, target)
 
 
+def move_folder(folder: Path, target: Path) -> None:
+    """Rename a folder of files, on the same disk; after a power failure it is whole, or not at `target`."""
+    for path in folder.iterdir():
+        _flush(path, os.O_RDWR)
+    os.replace(folder, target)
+    with suppress(OSError):  # as above
+        _flush(target.parent, os.O_RDONLY)
+
+
 def _flush(path: Path, flags: int) -> None:
     """Make the disk hold what was written to a file, or which names stand in a folder."""
     descriptor = os.open(path, flags)

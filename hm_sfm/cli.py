@@ -49,6 +49,8 @@ PHOTO_OPTIONS = (
      "a COLMAP model, or its cameras.txt beside its images.txt: the intrinsics of all photos, which are then kept"),
     ("--poses", "cameras.poses", "MODEL",
      "as --cameras, and the poses are kept, too: points are triangulated, nothing else is estimated"),
+    ("--rig", "cameras.rig", "FILE",
+     "a rig configuration as COLMAP has it, rig_config.json: cameras that are mounted together"),
     ("--masks", "masks.folder", "DIR",
      "do not match what is black in the masks of this folder: that of a/b.jpg is a/b.jpg.png, of the same size"),
     ("--camera-mask", "masks.camera", "FILE", "do not match what is black in this mask, in all photos of its size"),

@@ -24,6 +24,7 @@ import pycolmap
 import torch
 import torch.nn.functional as F
 
+from hm_sfm.bitmaps import read_bitmap
 from hm_sfm.colmap_models import quiet_colmap
 from hm_sfm.config import MatchingConfig
 from hm_sfm.coordinates import px_from_pixel_index
@@ -360,7 +361,7 @@ def match_by_ratio(descriptor0: torch.Tensor, descriptor1: torch.Tensor) -> tupl
 
 def read_rgb(image: PreparedImage) -> np.ndarray:
     """(H, W, 3) uint8 RGB of a prepared image, turned and reduced as it is; grey where there is no file to read."""
-    bitmap = pycolmap.Bitmap.read(image.ref.path, as_rgb=True) if image.ref.path.is_file() else None
+    bitmap = read_bitmap(image.ref.path, as_rgb=True) if image.ref.path.is_file() else None
     if bitmap is None or (bitmap.width, bitmap.height) != tuple(image.ref.size_wh):
         return np.repeat(np.rint(image.grey * 255).astype(np.uint8)[:, :, None], 3, axis=2)
     rgb = bitmap.to_array()

@@ -343,6 +343,7 @@ def finish_method(run: Run, method: Method) -> MethodResult:
     # What files that the configuration only names have said.
     shared += [[camera.params.tolist() for camera in run.cameras.cameras], run.cameras.camera_index]
     shared += [[pose.matrix().tolist() for pose in run.cameras.cam_from_world]]
+    shared += map(str, run.cameras.rigs)
     made_by = fingerprint(*shared, config.cameras, config.verification, config.mapping, method.made_by)
     finished = read_finished(folder, made_by)
     if finished is None:

@@ -23,7 +23,8 @@ class NetworkConfig:
 
     backbone: str = "light"
     coarse: str = "cosine"
-    """`attention` (LoFTR's transformer and dual softmax) or `cosine` (mutual nearest neighbours of plain features)."""
+    """`attention` (LoFTR's transformer and dual softmax), `aspan` (ASpanFormer's, which attends around a flow) or
+    `cosine` (mutual nearest neighbours of plain features)."""
     head: str = "homography"
     """`homography` (the paper) or `expectation` (LoFTR's point-to-patch baseline)."""
     window: int = 9
@@ -34,6 +35,8 @@ class NetworkConfig:
     """K: homography updates."""
     margin: int = 2
     """Cells by which the patch searched in image 1 is larger on each side (the paper: 0)."""
+    spacing: int = 1
+    """Cells from one point of image 0's patch that is looked up in image 1 to the next: 2 takes a quarter of the time."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,9 @@ class MatchingConfig:
     grow_below: int = 300
     """In pairs with fewer good matches, these spread to neighbours that the coarse stage missed; 0 is the paper. Where
     there are enough, grown matches are no gain: they are less exact than those that the coarse stage finds itself."""
+    retry_turned: bool = True
+    """Pairs with few good matches are looked at turned by quarters and reduced to 1/2 and 1/3, and matched again where
+    that fits clearly better."""
     feature_cache_mb: int = 1500
     """Per process that matches: two photos at least."""
     device: str = "auto"
@@ -124,6 +130,9 @@ class KeypointConfig:
     """Of the joint adjustment of each track's keypoints; 0 leaves them where they were first predicted."""
     max_keypoints: int = 8000
     """Per image, longest tracks first, spread over the image."""
+    native_px: int = 0
+    """Long edge at which a second fine pass places carried keypoints, of photos that are larger than images.long_edge_px
+    (never enlarged); 0: keypoints are as exact as the matching resolution allows."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +146,8 @@ class CameraConfig:
     """A COLMAP model, or its cameras.txt or cameras.bin, with the known intrinsics of each image; they stay fixed."""
     poses: str = ""
     """As `file`, and the poses are known, too: points are triangulated, nothing is mapped."""
+    rig: str = ""
+    """A rig configuration as COLMAP has it: which photos were taken together by cameras that are mounted together."""
 
 
 @dataclass(frozen=True)

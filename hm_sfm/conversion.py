@@ -20,6 +20,7 @@ import numpy as np
 import pycolmap
 
 from hm_sfm.atomic import make_folder, replace_file
+from hm_sfm.bitmaps import FOREIGN_EXTENSIONS
 from hm_sfm.colmap_models import quiet_colmap, read_model
 from hm_sfm.database import open_database
 from hm_sfm.errors import InputError
@@ -170,6 +171,12 @@ def undistort_photos(out: Path, folder: Path, image_folder: Path | None) -> pyco
         raise InputError(
             f"{photos} lacks {len(missing)} of {len(names)} photos of the model, for example {missing[0]!r}: name the "
             "folder of photos with --images"
+        )
+    foreign = [name for name in names if Path(name).suffix.lower() in FOREIGN_EXTENSIONS]
+    if foreign:
+        raise InputError(
+            f"COLMAP cannot undistort HEIC and WebP photos, such as {photos / foreign[0]}: convert the {len(foreign)} "
+            "of them to JPEG and reconstruct again"
         )
     # What COLMAP logs are the photos that it cannot read, which are told below.
     with tempfile.TemporaryDirectory(dir=folder) as temporary, quiet_colmap(pycolmap.logging.FATAL):

@@ -13,9 +13,11 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import pycolmap
 
-from hm_sfm.colmap_models import find_known
+from hm_sfm.bitmaps import read_bitmap
+from hm_sfm.colmap_models import find_known, quiet_colmap
 from hm_sfm.config import CameraConfig
 from hm_sfm.errors import ConfigError, InputError
+from hm_sfm.rigs import assign_cameras, read_rigs
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 # COLMAP's guess of a focal length that nothing is known about, relative to the longer side.
@@ -37,6 +39,8 @@ class Cameras:
     """Whether the intrinsics are known and stay as they are."""
     cam_from_world: tuple[pycolmap.Rigid3d, ...] = ()
     """Per image, in the order of the images; empty where the poses are not known."""
+    rigs: tuple[pycolmap.RigConfig, ...] = ()
+    """Each camera of a rig is one of `cameras`, with the images whose names begin with its image_prefix."""
 
 
 @dataclass(frozen=True)
@@ -54,22 +58,27 @@ def make_cameras(images: Sequence[ImageRef], config: CameraConfig) -> Cameras:
     and EXIF lens (or have none), and otherwise one per folder, size and lens. The focal length comes from EXIF, or is
     COLMAP's default, to be refined. `config.params` are known intrinsics for every camera; EXIF is then not read.
     `config.file` and `config.poses` name a COLMAP model that has them; it also says which images share a camera.
+    `config.rig` names a rig configuration: each camera of a rig is then a camera for itself; its intrinsics, where the
+    configuration has them, are refined.
 
-    Raises ConfigError on an unknown mode or model, on unusable params and where intrinsics are given twice, InputError
-    where images that have to share a camera differ in size, where an image cannot be read, and what find_known raises.
+    Raises ConfigError on an unknown mode or model, on unusable params, where intrinsics are given twice and where other
+    settings contradict the rigs; InputError where images that have to share a camera differ in size, where an image
+    cannot be read, and what find_known, read_rigs and assign_cameras raise.
     """
     given = [name for name in ("params", "file", "poses") if getattr(config, name)]
     if len(given) > 1:
         raise ConfigError(f"cameras.{given[0]} and cameras.{given[1]} both give the intrinsics: leave one of them out")
+    rigs = _read_rigs(config)
+    taken_by = assign_cameras(rigs, [image.name for image in images], Path(config.rig))
     if config.file or config.poses:
-        return _take_cameras(images, config)
+        return _take_cameras(images, config, rigs, taken_by)
     model = _parse_model(config.model)
     params = _parse_params(config.params, model)
     exif = [_ExifFocal(None, None) if params else _read_exif_focal(image) for image in images]
 
     groups: dict[Hashable, list[int]] = {}
     for index, key in enumerate(_camera_keys(images, exif, config.mode, known=bool(params))):
-        groups.setdefault(key, []).append(index)
+        groups.setdefault(("rig", *taken_by[index]) if taken_by[index] else key, []).append(index)
 
     cameras = []
     camera_index = [0] * len(images)
@@ -80,32 +89,70 @@ def make_cameras(images: Sequence[ImageRef], config: CameraConfig) -> Cameras:
             if images[member].size_wh != first.size_wh:
                 raise InputError(
                     f"{first.name} ({_size(first)}) and {images[member].name} ({_size(images[member])}) cannot share "
-                    f"a camera as camera mode {config.mode!r} asks for: their sizes differ"
+                    f"a camera as {config.rig if taken_by[member] else f'camera mode {config.mode!r}'} asks for: their "
+                    "sizes differ"
                 )
         focal_px = next((exif[member].focal_px for member in members if exif[member].focal_px), None)
         camera = _make_camera(len(cameras) + 1, model, first.size_wh, focal_px)
-        if params:
-            camera.params = params
+        in_rig = _find_intrinsics(rigs, taken_by[members[0]])
+        if params or in_rig:
+            if in_rig:
+                camera.model = in_rig.model
+            camera.params = in_rig.params if in_rig else params
             camera.has_prior_focal_length = True
             if camera.has_bogus_params(0.0, math.inf, math.inf):
                 raise ConfigError(
-                    f"camera params {config.params!r} do not fit {first.name}: the focal length must be positive and "
-                    f"the principal point within {_size(first)}"
+                    f"camera params {config.params or camera.params_to_string()!r} do not fit {first.name}: the focal "
+                    f"length must be positive and the principal point within {_size(first)}"
                 )
         cameras.append(camera)
-    return Cameras(tuple(cameras), tuple(camera_index), known=bool(params))
+    return Cameras(tuple(cameras), tuple(camera_index), known=bool(params), rigs=rigs)
 
 
-def _take_cameras(images: Sequence[ImageRef], config: CameraConfig) -> Cameras:
+def _read_rigs(config: CameraConfig) -> tuple[pycolmap.RigConfig, ...]:
+    """The rigs, if any. Raises ConfigError where other settings contradict them, and what read_rigs raises."""
+    if not config.rig:
+        return ()
+    if config.mode not in ("auto", "per-folder"):
+        raise ConfigError(
+            f"cameras.rig gives each camera of a rig intrinsics of its own: leave out camera mode {config.mode!r}"
+        )
+    if config.poses:
+        raise ConfigError("cameras.poses gives the pose of each photo, which leaves nothing to cameras.rig: drop one")
+    rigs = read_rigs(Path(config.rig))
+    has_intrinsics = any(camera.camera is not None for rig in rigs for camera in rig.cameras)
+    for name in ("params", "file"):
+        if getattr(config, name) and has_intrinsics:
+            raise ConfigError(
+                f"cameras.{name} and the rig configuration {config.rig} both give the intrinsics: drop one"
+            )
+    return rigs
+
+
+def _find_intrinsics(rigs: Sequence[pycolmap.RigConfig], taker: tuple[int, int] | None) -> pycolmap.Camera | None:
+    return rigs[taker[0]].cameras[taker[1]].camera if taker else None
+
+
+def _take_cameras(
+    images: Sequence[ImageRef],
+    config: CameraConfig,
+    rigs: tuple[pycolmap.RigConfig, ...],
+    taken_by: Sequence[tuple[int, int] | None],
+) -> Cameras:
     """The cameras of a COLMAP model, and its poses where these are asked for."""
     known, poses = find_known(Path(config.poses or config.file), images)
-    number_of = {camera_id: i for i, camera_id in enumerate(dict.fromkeys(camera.camera_id for camera in known))}
-    camera_index = tuple(number_of[camera.camera_id] for camera in known)
+    # A camera that several cameras of a rig share becomes one each: what is known stays the same.
+    keys = [(camera.camera_id, taker) for camera, taker in zip(known, taken_by)]
+    number_of = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    in_rigs = [taker for _, taker in number_of if taker]
+    if len(set(in_rigs)) < len(in_rigs):
+        raise InputError(f"a rig needs one camera for each image_prefix in {config.rig}, {config.file} has several")
+    camera_index = tuple(number_of[key] for key in keys)
     cameras = [known[camera_index.index(number)] for number in range(len(number_of))]
     for camera_id, camera in enumerate(cameras, start=1):
         camera.camera_id = camera_id
         camera.has_prior_focal_length = True
-    return Cameras(tuple(cameras), camera_index, known=True, cam_from_world=tuple(poses) if config.poses else ())
+    return Cameras(tuple(cameras), camera_index, True, tuple(poses) if config.poses else (), rigs)
 
 
 def _camera_keys(images: Sequence[ImageRef], exif: Sequence[_ExifFocal], mode: str, known: bool) -> list[Hashable]:
@@ -126,7 +173,7 @@ def _camera_keys(images: Sequence[ImageRef], exif: Sequence[_ExifFocal], mode: s
 
 
 def _read_exif_focal(image: ImageRef) -> _ExifFocal:
-    bitmap = pycolmap.Bitmap.read(image.path, as_rgb=False)
+    bitmap = read_bitmap(image.path, as_rgb=False)
     if bitmap is None:
         raise InputError(f"cannot read {image.path}: it is not an image that COLMAP can open")
     return _ExifFocal(bitmap.exif_focal_length(), bitmap.exif_camera_model())
@@ -184,8 +231,9 @@ def write_database(
 
     keypoints: one per image, in the order of the images; they are in COLMAP's frame already and are stored bit for
     bit as float32 (K, 2). matches: any pairs of these images; empty ones are left out. Image ids are 1..N in the order
-    of the images; each camera has a rig of its own, each image a frame of its own. Positions from EXIF become pose
-    priors (latitude, longitude, altitude), for COLMAP's tools: the mappers here do not use them.
+    of the images; each camera has a rig of its own, each image a frame of its own, except for those of `cameras.rigs`.
+    Positions from EXIF become pose priors (latitude, longitude, altitude), for COLMAP's tools: the mappers here do not
+    use them.
 
     Raises ValueError where the arguments contradict each other.
     """
@@ -226,6 +274,9 @@ def write_database(
                 if len(pair_matches):
                     pair = pair_matches.pair
                     database.write_matches(image_ids[pair.name0], image_ids[pair.name1], pair_matches.indices)
+        if cameras.rigs:
+            with pycolmap.Database.open(temporary) as database, pycolmap.DatabaseTransaction(database), quiet_colmap():
+                pycolmap.apply_rig_config(list(cameras.rigs), database)
         _remove_leftovers(path)
         os.replace(temporary, path)
     finally:

@@ -224,7 +224,7 @@ def choose_advice(cause: Cause, names: Sequence[str], evidence: Evidence) -> tup
         LARGER: max(max(evidence.images[name].size_wh) for name in names) <= config.images.long_edge_px
         or config.images.long_edge_px >= 1600,
         INTRINSICS: all(evidence.focal_known[name] for name in names),
-        OWN_CAMERAS: config.cameras.mode == "per-image",
+        OWN_CAMERAS: config.cameras.mode == "per-image" or bool(config.cameras.rig),
     }
     return tuple(advice for advice in ADVICE[cause] if not useless.get(advice, False))
 

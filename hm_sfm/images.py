@@ -1,7 +1,7 @@
 """Stage 1: the photos of a folder, and one photo made ready for the network: grey, upright, reduced.
 
 Photos are read as COLMAP reads them, unrotated. Where EXIF says that a photo is turned it is turned for matching,
-and `PreparedImage.stored_from_scaled` carries the points back.
+and `PreparedImage.stored_from_scaled` carries the points back. HEIC, which COLMAP cannot read, is upright when decoded.
 """
 
 import logging
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pycolmap
 
+from hm_sfm.bitmaps import HEIC_EXTENSIONS, INSTALL_HEIC, can_read_heic, read_bitmap
 from hm_sfm.coordinates import rotation_matrix
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.types import ImageRef, freeze_array
@@ -19,7 +20,6 @@ from hm_sfm.types import ImageRef, freeze_array
 logger = logging.getLogger(__name__)
 
 EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-HEIC_EXTENSIONS = (".heic", ".heif")
 MIN_EDGE_PX = 32
 """The network's coarse cells are 8 px: below this there is nothing to match."""
 
@@ -34,6 +34,8 @@ CV_FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENT
 
 JPEG_MAGIC = b"\xff\xd8"
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+HEIC_MAGIC = b"ftyp"
+"""After the 4 bytes of a length."""
 PNG_END = b"IEND\xaeB`\x82"
 
 
@@ -71,7 +73,8 @@ def list_images(folder: Path) -> ImageList:
     """List the photos below `folder`, subfolders included, sorted by name; hidden files and folders are ignored.
 
     A file that is named like an image but is damaged, smaller than 32 px on a side, or unknown to COLMAP is skipped:
-    it is logged as a warning, HEIC photos together as one, and reported in `skipped`.
+    it is logged as a warning and reported in `skipped`; where the package for HEIC is not installed, HEIC photos are
+    skipped with one warning.
 
     Raises InputError where the folder does not exist, is not a folder, or holds no usable image.
     """
@@ -80,13 +83,15 @@ def list_images(folder: Path) -> ImageList:
         raise InputError(f"the image folder {folder} " + ("is not a folder" if folder.exists() else "does not exist"))
     relative = [path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir()]
     names = [path.as_posix() for path in relative if not any(part.startswith(".") for part in path.parts)]
-    candidates = sorted(name for name in names if Path(name).suffix.lower() in EXTENSIONS)
-    heic = sorted(name for name in names if Path(name).suffix.lower() in HEIC_EXTENSIONS)
+    kinds = EXTENSIONS + HEIC_EXTENSIONS if can_read_heic() else EXTENSIONS
+    candidates = sorted(name for name in names if Path(name).suffix.lower() in kinds)
+    heic = sorted(name for name in set(names).difference(candidates) if Path(name).suffix.lower() in HEIC_EXTENSIONS)
     if not candidates and not heic:
-        kinds = ", ".join(extension[1:] for extension in EXTENSIONS)
-        raise InputError(f"the image folder {folder} holds {len(names)} files but no image ({kinds})")
+        listed = ", ".join(extension[1:] for extension in kinds)
+        raise InputError(f"the image folder {folder} holds {len(names)} files but no image ({listed})")
     images = []
-    skipped = [(name, f"{folder / name} is HEIC, which COLMAP cannot read: convert it to JPEG") for name in heic]
+    reason = f"is HEIC, which needs the package pillow-heif: {INSTALL_HEIC}, or convert it to JPEG"
+    skipped = [(name, f"{folder / name} {reason}") for name in heic]
     if heic:
         logger.warning("skipped: %s (%d such files)", skipped[0][1], len(heic))
     for name in candidates:
@@ -107,14 +112,15 @@ def read_ref(path: Path, name: str | None = None) -> ImageRef:
 
     `name` defaults to the file's own name.
 
-    Raises InputError where the file cannot be read or decoded, is cut short, or is smaller than 32 px on a side.
+    Raises InputError where the file cannot be read or decoded, is cut short, or is smaller than 32 px on a side, and
+    MissingPackageError where it needs a package that is not installed.
     """
     path = Path(path)
     name = path.name if name is None else name
     if not _is_storable(name):
         raise InputError(f"{str(path)!r} has a line break or bytes that are not UTF-8 in its name")
     data = _read_bytes(path)
-    bitmap = pycolmap.Bitmap.read(path, as_rgb=False)
+    bitmap = read_bitmap(path, as_rgb=False)
     if bitmap is None:
         if _decode(data) is None:
             raise InputError(f"{path} cannot be decoded as an image")
@@ -147,7 +153,7 @@ def prepare_image(ref: ImageRef, long_edge_px: int) -> PreparedImage:
         grey = _decode(data)
     else:
         # OpenCV turns a TIFF as its orientation tag says, even when told not to; COLMAP's reader does not.
-        bitmap = pycolmap.Bitmap.read(ref.path, as_rgb=False)
+        bitmap = read_bitmap(ref.path, as_rgb=False)
         grey = None if bitmap is None else bitmap.to_array().reshape(bitmap.height, bitmap.width)
     if grey is None:
         raise InputError(f"{ref.path} cannot be decoded as an image")
@@ -214,6 +220,8 @@ def _is_complete(data: bytes) -> bool:
         return _has_jpeg_end(data)
     if data.startswith(PNG_MAGIC):
         return PNG_END in data
+    if data[4:8] == HEIC_MAGIC:
+        return True  # what is cut short cannot be decoded
     return _decode(data) is not None
 
 

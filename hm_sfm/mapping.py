@@ -5,20 +5,27 @@ it works; the last adjustment of a model, the global mapper and triangulation ru
 appears at once and complete, or not at all.
 """
 
+import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
+from hm_sfm.bitmaps import open_to_colmap
 from hm_sfm.colmap_models import quiet_colmap
 from hm_sfm.config import MappingConfig
 from hm_sfm.database import Cameras, open_database
 from hm_sfm.errors import ConfigError
+from hm_sfm.rigs import lack_poses
+from hm_sfm.snapshots import SNAPSHOT_FOLDER, Snapshots, digest_inputs
 from hm_sfm.types import ImageRef, MappingResult
+
+logger = logging.getLogger(__name__)
 
 # Global bundle adjustment each time the model grew by 30 %, not COLMAP's 10 %: about a fifth less time on dense
 # keypoints, at the same result; local bundle adjustment follows every image anyway.
@@ -34,6 +41,10 @@ LOCAL_TOLERANCE = 1e-3
 GLOBAL_REFINEMENTS = 2
 LOCAL_REFINEMENTS = 1
 
+# Images, or frames of rigs, that a model gains from one snapshot to the next: mapping them takes longer by far than
+# writing it.
+SNAPSHOT_IMAGES = 20
+
 
 def map_images(
     database_path: Path,
@@ -46,13 +57,18 @@ def map_images(
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """Build models from a verified database: triangulate_images where the poses are known, else by `config.mapper`.
 
-    images, cameras: those that the database was written with. Arguments, results and what is raised are otherwise those
-    of map_incrementally; raises ConfigError where there is no such mapper.
+    images, cameras: those that the database was written with. Where their rigs lack poses, calibrate_rigs finds them
+    first. Arguments, results and what is raised are otherwise those of map_incrementally; raises ConfigError where
+    there is no such mapper.
     """
     if cameras.cam_from_world:
-        return triangulate_images(database_path, image_folder, sparse_folder, images, cameras, config, on_image)
+        with open_to_colmap(images, image_folder) as readable_folder:
+            return triangulate_images(database_path, readable_folder, sparse_folder, images, cameras, config, on_image)
     build = choose_mapper(config)
-    return build(database_path, image_folder, sparse_folder, config, cameras.known, on_image)
+    with open_to_colmap(images, image_folder) as readable_folder:
+        if lack_poses(cameras.rigs):
+            calibrate_rigs(database_path, readable_folder, cameras, config)
+        return build(database_path, readable_folder, sparse_folder, config, cameras.known, on_image)
 
 
 def choose_mapper(config: MappingConfig) -> Callable[..., tuple[pycolmap.Reconstruction, ...]]:
@@ -61,6 +77,37 @@ def choose_mapper(config: MappingConfig) -> Callable[..., tuple[pycolmap.Reconst
     if config.mapper not in mappers:
         raise ConfigError(f"mapping.mapper must be incremental or global, found {config.mapper!r}")
     return mappers[config.mapper]
+
+
+def calibrate_rigs(database_path: Path, image_folder: Path, cameras: Cameras, config: MappingConfig) -> bool:
+    """Find the poses that `cameras.rigs` lack, and write them to the database, as COLMAP's rig_configurator does it.
+
+    A model is built as if there were no rigs, by `config.mapper`; the poses are averages over it. COLMAP needs them to
+    map with rigs. Returns whether they were found; where not, the database has no rigs any more, and a warning is
+    logged.
+    """
+    database_path = Path(database_path)
+    with _make_work_folder(database_path.parent, ".rigs.") as work_folder:
+        own_copy = work_folder / "database.db"
+        shutil.copy(database_path, own_copy)
+        with quiet_colmap(pycolmap.logging.FATAL), pycolmap.Database.open(own_copy) as database:
+            pycolmap.apply_rig_config([], database)
+        build = choose_mapper(config)
+        models = build(own_copy, image_folder, work_folder / "sparse", config, cameras.known)
+        with quiet_colmap(pycolmap.logging.FATAL), pycolmap.Database.open(own_copy) as database:
+            if models:
+                pycolmap.apply_rig_config(list(cameras.rigs), database, models[0])
+            sensors = [pose for rig in database.read_all_rigs() for pose in rig.non_ref_sensors.values()]
+            is_complete = bool(sensors) and all(pose is not None for pose in sensors)
+            if not is_complete:
+                pycolmap.apply_rig_config([], database)
+        os.replace(own_copy, database_path)
+    if not is_complete:
+        logger.warning(
+            "the rigs are left out: no model has photos of all their cameras, from which the missing "
+            "cam_from_rig_rotation and cam_from_rig_translation could be found"
+        )
+    return is_complete
 
 
 def map_incrementally(
@@ -74,7 +121,11 @@ def map_incrementally(
     """Build models from a verified database with COLMAP's incremental mapper, then adjust and filter each of them.
 
     image_folder: for the colours of the points. fix_intrinsics: keep all cameras as the database has them.
-    on_image: called once per registered image; the mapper may register an image again in another model or attempt.
+    on_image: called once per registered image, of a rig once per frame; the mapper may register an image again in
+    another model or attempt.
+
+    While a model grows, the folder `snapshots` beside `sparse_folder` holds its newest snapshot. The same call goes on
+    from there after it was killed; snapshots of another database or configuration are not used.
 
     Returns the models, most registered images first, then most points. They are also in `sparse_folder`/0, 1, ... as
     COLMAP binary, in this order; what the folder held before is gone, and without a model there is no folder.
@@ -83,7 +134,15 @@ def map_incrementally(
     return _write_models(
         database_path,
         sparse_folder,
-        lambda raw: _run_mapper(database_path, image_folder, raw, config, fix_intrinsics, on_image),
+        lambda raw: _run_mapper(
+            database_path,
+            image_folder,
+            raw,
+            config,
+            fix_intrinsics,
+            on_image,
+            Path(sparse_folder).with_name(SNAPSHOT_FOLDER),
+        ),
     )
 
 
@@ -140,32 +199,45 @@ def _write_models(
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """Sort the models that `build` makes, given a new folder to work in, and put them in the place of `sparse_folder`.
 
-    Without verified matches there is nothing to build. Raises InputError where there is no database.
+    Snapshots of them are then removed, and so is what killed processes left. Without verified matches there is nothing
+    to build. Raises InputError where there is no database.
     """
     sparse_folder = Path(sparse_folder)
     sparse_folder.parent.mkdir(parents=True, exist_ok=True)
     with open_database(database_path) as database:
         can_map = database.num_inlier_matches() > 0  # rejected pairs count as verified pairs, without inliers
-    with tempfile.TemporaryDirectory(dir=sparse_folder.parent, prefix=f".{sparse_folder.name}.") as temporary:
+    with _make_work_folder(sparse_folder.parent, f".{sparse_folder.name}.") as work_folder:
         models: list[pycolmap.Reconstruction] = []
         if can_map:
-            raw = Path(temporary) / "mapper"
+            raw = work_folder / "mapper"
             raw.mkdir()
             # The one error that COLMAP logs here is that there is no model, which the caller is told anyway.
             with quiet_colmap(pycolmap.logging.FATAL):
                 models = build(raw)
         models.sort(key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
 
-        finished = Path(temporary) / "sparse"
+        finished = work_folder / "sparse"
         for number, model in enumerate(models):
             folder = finished / str(number)
             folder.mkdir(parents=True)
             model.write_binary(folder)
         if sparse_folder.exists():
-            os.replace(sparse_folder, Path(temporary) / "replaced")
+            os.replace(sparse_folder, work_folder / "replaced")
         if models:
             os.replace(finished, sparse_folder)
+        snapshots = sparse_folder.with_name(SNAPSHOT_FOLDER)
+        if snapshots.exists():  # all of them at once: none is left with files missing
+            os.replace(snapshots, work_folder / "snapshots")
     return tuple(models)
+
+
+@contextmanager
+def _make_work_folder(parent: Path, prefix: str) -> Iterator[Path]:
+    """A folder for the block, in the place of those that killed processes left."""
+    for left in parent.glob(f"{prefix}*/"):
+        shutil.rmtree(left)
+    with tempfile.TemporaryDirectory(dir=parent, prefix=prefix) as folder:
+        yield Path(folder)
 
 
 def _run_mapper(
@@ -175,11 +247,21 @@ def _run_mapper(
     config: MappingConfig,
     fix_intrinsics: bool,
     on_image: Callable[[], None] | None,
+    snapshot_folder: Path,
 ) -> list[pycolmap.Reconstruction]:
     options = _pipeline_options(config, fix_intrinsics)
+    made_from = digest_inputs(database_path, config, fix_intrinsics)
+    snapshots = Snapshots(snapshot_folder, output_folder.with_name("growing"), made_from)
+    options.snapshot_path = snapshots.growing
+    options.snapshot_frames_freq = SNAPSHOT_IMAGES
+    on_image = on_image or (lambda: None)
 
-    def on_initial_pair() -> None:
-        on_image()
+    def on_first_images() -> None:
+        for _ in range(snapshots.begin_model()):
+            on_image()
+
+    def on_next_image() -> None:
+        snapshots.add_image()
         on_image()
 
     models = pycolmap.incremental_mapping(
@@ -187,8 +269,9 @@ def _run_mapper(
         image_folder,
         output_folder,
         options,
-        initial_image_pair_callback=on_initial_pair if on_image else None,
-        next_image_callback=on_image,
+        input_path=snapshots.newest or "",
+        initial_image_pair_callback=on_first_images,
+        next_image_callback=on_next_image,
     )
     for model in models.values():
         _adjust(model, options)
@@ -267,8 +350,8 @@ def _map_all(
         _adjust(model, adjustment)
         # It poses every image, the incremental mapper only those that so many points agree with.
         fewest = adjustment.mapper.abs_pose_min_num_inliers
-        frames = {image.frame_id for image in model.images.values() if image.num_points3D < fewest}
-        for frame_id in frames & set(model.reg_frame_ids()):
+        frames = {image.frame_id for image in model.images.values() if image.num_points3D >= fewest}
+        for frame_id in set(model.reg_frame_ids()) - frames:
             model.deregister_frame(frame_id)
     return [model for model in models if model.num_reg_images() >= config.min_model_size]
 

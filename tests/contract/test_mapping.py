@@ -1,6 +1,9 @@
 """What hm_sfm.mapping makes of oracle scenes: cameras, points and keypoints known, matches exact or planted wrong."""
 
+import shutil
 import signal
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,11 +11,13 @@ import numpy as np
 import pycolmap
 import pytest
 
+import hm_sfm.mapping
 from hm_sfm.config import MappingConfig, VerificationConfig
 from hm_sfm.database import Cameras, open_database, write_database
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.hloc import read_features, read_matches, write_features, write_matches
 from hm_sfm.mapping import choose_mapper, map_globally, map_images, map_incrementally, summarise_models
+from hm_sfm.snapshots import digest_inputs
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, PairMatches
 from hm_sfm.verification import is_convincing, verify_database, verify_pair, verify_pairs
 
@@ -192,6 +197,86 @@ def test_missing_database_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="missing.db"):
         map_incrementally(tmp_path / "missing.db", tmp_path, tmp_path / "sparse", MappingConfig(), False)
     assert not list(tmp_path.iterdir())
+
+
+# Snapshots
+
+KILLED_MAPPING = """
+import os, signal, sys
+from pathlib import Path
+import hm_sfm.mapping
+from hm_sfm.config import MappingConfig
+
+hm_sfm.mapping.SNAPSHOT_IMAGES = 3
+registered = []
+
+def kill_at_nine():
+    registered.append(1)
+    if len(registered) == 9:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+folder = Path(sys.argv[1])
+hm_sfm.mapping.map_incrementally(folder / "database.db", folder, folder / "sparse", MappingConfig(), True, kill_at_nine)
+"""
+
+
+@pytest.fixture
+def inputs_of_mapper(monkeypatch) -> list[Path | str]:
+    """Grows by what each call of the mapper goes on from; snapshots are made often."""
+    calls: list[Path | str] = []
+    run = pycolmap.incremental_mapping
+    monkeypatch.setattr(hm_sfm.mapping, "SNAPSHOT_IMAGES", 3)
+    monkeypatch.setattr(
+        hm_sfm.mapping.pycolmap,
+        "incremental_mapping",
+        lambda *args, **options: (calls.append(options["input_path"]), run(*args, **options))[1],
+    )
+    return calls
+
+
+def test_a_killed_mapping_goes_on_from_its_newest_snapshot(tmp_path, inputs_of_mapper):
+    oracle = make_oracle(tmp_path, num_images=12, num_points=100, seed=5)
+    folder = tmp_path / "out"
+    folder.mkdir()
+    path = write_and_verify(folder, oracle, make_known_camera(oracle))
+    killed = subprocess.run([sys.executable, "-c", KILLED_MAPPING, str(folder)], timeout=60, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    (snapshot,) = (folder / "snapshots").iterdir()
+    stored = int(snapshot.suffix[1:])
+    assert 5 <= stored <= 9 and pycolmap.Reconstruction(snapshot).num_reg_images() == stored
+    (left,) = folder.glob(".sparse.*")  # of the killed process, with a snapshot that it may have been writing
+    (left / "growing" / "9999999999999").mkdir(parents=True)
+    (left / "growing" / "9999999999999" / "cameras.bin").write_bytes(b"\1")
+    other = Path(shutil.copytree(folder, tmp_path / "other"))
+
+    path = write_and_verify(folder, oracle, make_known_camera(oracle))  # as reconstruct does
+    registered = []
+    models = map_incrementally(
+        path, folder, folder / "sparse", MappingConfig(), True, on_image=lambda: registered.append(1)
+    )
+    assert inputs_of_mapper == [snapshot]
+    assert len(models) == 1 and len(registered) == 12
+    assert_same_up_to_similarity(models[0], oracle.model)
+    assert sorted(entry.name for entry in folder.iterdir()) == ["database.db", "sparse"]
+
+    # Not with another configuration.
+    (model,) = map_incrementally(other / "database.db", other, other / "sparse", MappingConfig(seed=1), True)
+    assert inputs_of_mapper[1:] == [""] and model.num_reg_images() == 12
+    assert sorted(entry.name for entry in other.iterdir()) == ["database.db", "sparse"]
+
+
+def test_what_snapshots_are_made_from(tmp_path, oracle):
+    path = write_and_verify(tmp_path, oracle, make_known_camera(oracle))
+    first = digest_inputs(path, MappingConfig(), True)
+    assert digest_inputs(path, MappingConfig(min_model_size=3), True) != first
+    assert digest_inputs(path, MappingConfig(), False) != first
+    write_and_verify(tmp_path, oracle, make_unknown_camera(oracle))
+    assert digest_inputs(path, MappingConfig(), True) != first
+    write_and_verify(tmp_path, oracle, make_known_camera(oracle))
+    assert digest_inputs(path, MappingConfig(), True) == first
+    with open_database(path) as database:
+        database.delete_matches(1, 2)
+    assert digest_inputs(path, MappingConfig(), True) != first
 
 
 # Other mappers

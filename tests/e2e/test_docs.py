@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 import yaml
@@ -15,6 +16,7 @@ from hm_sfm.cli import make_parser
 from hm_sfm.config import parse_config
 from hm_sfm.diagnosis import ADVICE, Cause
 from hm_sfm.errors import InputError
+from hm_sfm.rigs import assign_cameras, read_rigs
 from hm_sfm.training.loop import TrainConfig, check_config
 from hm_sfm.training.multiview import VALIDATION_SCENES
 
@@ -105,6 +107,27 @@ def test_the_python_example_of_hloc_runs(scene, out, tmp_path, monkeypatch, run)
     names: dict = {}
     exec(example, names)
     assert names["database"].exists() and sum(map(len, names["matches"])) > 1000
+
+
+def test_the_python_example_of_a_matcher_runs(scene, tmp_path, monkeypatch, run, matched_pairs):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(scene.images, "photos")
+    Path("pairs.txt").write_text("view_00.jpg view_01.jpg\n")
+    (example,) = code_blocks("use-my-own-matcher.md", "python")
+    exec(example, {})
+    command = next(command for command in list_commands("use-my-own-matcher.md") if command[0] == "match")
+    finished = run(*command, "--quiet")
+    assert (finished.code, finished.err) == (0, "")
+    assert len(matched_pairs) == 1
+    with h5py.File("out/mine/matches.h5") as h5:
+        assert np.count_nonzero(h5["000000/score"][()] > 0.5) > 30
+
+
+def test_the_example_of_a_rig(tmp_path):
+    (example,) = code_blocks("photos-as-people-have-them.md", "json")
+    (tmp_path / "rig.json").write_text(example)
+    (rig,) = read_rigs(tmp_path / "rig.json")
+    assert assign_cameras([rig], ["left/0001.jpg", "right/0001.jpg"], tmp_path) == [(0, 0), (0, 1)]
 
 
 def test_the_training_configurations_are_complete():

@@ -98,6 +98,20 @@ def test_cameras_that_name_other_images(scene, reconstructed, tmp_path, run, dig
     assert not (tmp_path / "out").exists()
 
 
+def test_a_rig_that_does_not_match(scene, tmp_path, run):
+    rig = tmp_path / "rig.json"
+    command = ("match", scene.images, tmp_path / "out", "--rig", rig)
+    assert_refused(run(*command), rig, "No such file")
+    rig.write_text("[{")
+    assert_refused(run(*command), rig, "not valid JSON")
+    rig.write_text('[{"cameras": [{"image_prefix": "left/"}]}]')
+    assert_refused(run(*command), rig, "needs one camera with ref_sensor true")
+    rig.write_text('[{"cameras": [{"image_prefix": "left/", "ref_sensor": true}]}]')
+    assert_refused(run(*command), rig, "no photo has a name that begins with 'left/'")
+    assert_refused(run(*command, "--camera-mode", "per-image"), "cameras.rig", "'per-image'")
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_global_mapper(scene, out, run, tmp_path):
     finished = run("reconstruct", scene.images, out, "--mapper", "global", "--quiet")
     assert finished.code == 0, finished.err

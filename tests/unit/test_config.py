@@ -144,7 +144,7 @@ def test_parsing_a_written_out_configuration_gives_it_back():
 
 @pytest.mark.parametrize("name, value", leaves(Config()), ids=lambda part: part if isinstance(part, str) else "")
 def test_the_fingerprint_changes_with_any_value(name, value):
-    other = {str: "other", int: 4711, float: 0.4711}[type(value)]
+    other = {str: "other", int: 4711, float: 0.4711, bool: not value}[type(value)]
     section, key = name.split(".")
     changed = dataclasses.replace(
         Config(), **{section: dataclasses.replace(getattr(Config(), section), **{key: other})}

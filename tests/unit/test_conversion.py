@@ -261,6 +261,19 @@ def test_photos_that_are_elsewhere(out, tmp_path):
     assert not (tmp_path / "ns").exists()
 
 
+@pytest.mark.parametrize("to", ["3dgs", "nerfstudio"])
+def test_what_colmap_cannot_undistort(tmp_path, to):
+    out = make_run(tmp_path, "SIMPLE_RADIAL", [300.0, 160.0, 120.0, 0.08], ("1.png", "2.webp", "3.png", "4.webp"))
+    (tmp_path / "photos" / "2.webp").rename(tmp_path / "photos" / "2.HEIC")
+    model = pycolmap.Reconstruction(out / "sparse" / "0")
+    next(image for image in model.images.values() if image.name == "2.webp").name = "2.HEIC"
+    model.write_binary(out / "sparse" / "0")
+    with pytest.raises(InputError, match="cannot undistort HEIC and WebP photos, such as .*: convert the 2 of them to"):
+        convert_run(out, to, tmp_path / "target")
+    convert_run(out, "txt", tmp_path / "txt")
+    assert not (tmp_path / "target").exists() and (tmp_path / "txt" / "images.txt").exists()
+
+
 def test_a_photo_that_cannot_be_read(out, tmp_path, capfd):
     (tmp_path / "photos" / NAMES[1]).write_bytes(b"no image")
     with pytest.raises(InputError, match=f"cannot undistort 1 of 4 photos, for example .*{NAMES[1]}"):

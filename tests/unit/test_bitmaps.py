@@ -1,0 +1,130 @@
+"""Photos of kinds that COLMAP cannot read: HEIC, turned as phones store it, and WebP."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pillow_heif
+import pycolmap
+import pytest
+from PIL import Image
+
+from hm_sfm.bitmaps import open_to_colmap, read_bitmap
+from hm_sfm.config import CameraConfig
+from hm_sfm.database import make_cameras
+from hm_sfm.errors import InputError, MissingPackageError
+from hm_sfm.images import list_images, prepare_image, read_ref
+
+
+def textured(width: int, height: int) -> np.ndarray:
+    """(H, W, 3) uint8, smooth."""
+    small = np.random.default_rng(0).integers(20, 236, (height // 16, width // 16, 3), dtype=np.uint8)
+    return cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
+def write_photo(path: Path, stored: np.ndarray, orientation: int = 1) -> Path:
+    """A HEIC or JPEG with the EXIF of a phone; HEIC says by itself, too, how it is turned."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    exif[0x010F], exif[0x0110] = "Phone", "Twelve"
+    exif[0x8769] = {0xA405: 28}
+    exif[0x8825] = {1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 45.0, 0.0), 5: b"\0", 6: 512.5}
+    image = Image.fromarray(stored)
+    if path.suffix.lower() == ".jpg":
+        image.save(path, exif=exif, quality=98)
+    else:
+        pillow_heif.from_pillow(image).save(path, quality=98, exif=exif.tobytes())
+    return path
+
+
+@pytest.mark.parametrize(("orientation", "turn"), [(1, None), (3, cv2.ROTATE_180), (6, cv2.ROTATE_90_CLOCKWISE)])
+def test_heic_comes_upright_and_is_not_turned_again(tmp_path, orientation, turn):
+    stored = textured(320, 240)
+    write_photo(tmp_path / "a.HEIC", stored, orientation)
+    write_photo(tmp_path / "b.jpg", stored, orientation)
+    upright = stored if turn is None else cv2.rotate(stored, turn)
+
+    heic, jpeg = list_images(tmp_path).images
+
+    assert heic.size_wh == upright.shape[1::-1] and heic.rotation_deg == 0
+    assert heic.gps == jpeg.gps is not None
+    prepared = [prepare_image(photo, 160) for photo in (heic, jpeg)]
+    assert prepared[0].scaled_wh == prepared[1].scaled_wh
+    assert np.abs(prepared[0].grey - prepared[1].grey).mean() < 0.01
+    np.testing.assert_allclose(prepared[0].stored_from_scaled, np.diag([2, 2, 1]))
+    rgb = read_bitmap(heic.path, as_rgb=True).to_array()
+    assert np.abs(rgb.astype(int) - upright).mean() < 4
+
+
+def test_the_focal_length_arrives_as_it_does_of_a_jpeg(tmp_path):
+    for name in ("a.heic", "b.jpg"):
+        write_photo(tmp_path / name, textured(320, 240))
+    images = list_images(tmp_path).images
+    (camera,) = make_cameras(images, CameraConfig()).cameras  # one: same size, same lens
+    assert camera.has_prior_focal_length
+    assert camera.focal_length == pycolmap.infer_camera_from_image(tmp_path / "b.jpg").focal_length
+
+
+def test_heic_that_is_grey_transparent_or_without_exif(tmp_path):
+    rgb = textured(64, 48)
+    images = {"grey": Image.fromarray(rgb).convert("L"), "rgba": Image.fromarray(np.dstack([rgb, rgb[:, :, 0]]))}
+    for name, image in images.items():
+        pillow_heif.from_pillow(image).save(tmp_path / f"{name}.heif", quality=98)
+    photos = list_images(tmp_path).images
+    assert [photo.name for photo in photos] == ["grey.heif", "rgba.heif"]
+    expected = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) / 255
+    for photo in photos:
+        assert photo.gps is None and np.abs(prepare_image(photo, 64).grey - expected).mean() < 0.02
+
+
+def test_a_jpeg_that_is_named_heic_is_read_as_what_it_is(tmp_path):
+    write_photo(tmp_path / "a.jpg", textured(320, 240), 6).rename(tmp_path / "a.heic")
+    (photo,) = list_images(tmp_path).images
+    assert (photo.size_wh, photo.rotation_deg) == ((320, 240), 90)
+    assert prepare_image(photo, 320).scaled_wh == (240, 320)
+
+
+def test_damaged_heic_is_skipped(tmp_path, capfd):
+    whole = write_photo(tmp_path / "good.heic", textured(320, 240)).read_bytes()
+    for name, data in {"cut": whole[:-10], "half": whole[: len(whole) // 2], "empty": b"", "text": b"no image"}.items():
+        (tmp_path / f"{name}.heic").write_bytes(data)
+    listing = list_images(tmp_path)
+    assert [photo.name for photo in listing.images] == ["good.heic"]
+    assert [name for name, _ in listing.skipped] == ["cut.heic", "empty.heic", "half.heic", "text.heic"]
+    assert all("cannot be decoded as an image" in reason for _, reason in listing.skipped)
+    assert capfd.readouterr().err == ""
+
+
+def test_without_the_package_one_line_says_how_to_install_it(tmp_path, monkeypatch):
+    path = write_photo(tmp_path / "a.heic", textured(64, 48))
+    monkeypatch.setattr("hm_sfm.bitmaps.can_read_heic", lambda: False)
+    with pytest.raises(MissingPackageError, match=r'a.heic is HEIC, .* pip install "hm_sfm\[heif\]"'):
+        read_ref(path)
+
+
+@pytest.mark.parametrize("flags", [[], [cv2.IMWRITE_WEBP_QUALITY, 101]], ids=["lossy", "lossless"])
+def test_webp(tmp_path, flags):
+    rgb = textured(64, 48)
+    cv2.imwrite(str(tmp_path / "a.webp"), rgb[:, :, ::-1], flags)
+    photo = read_ref(tmp_path / "a.webp")
+    assert photo.size_wh == (64, 48) and not make_cameras([photo], CameraConfig()).cameras[0].has_prior_focal_length
+    expected = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) / 255
+    assert np.abs(prepare_image(photo, 64).grey - expected).mean() < 0.03
+    assert np.abs(read_bitmap(photo.path, as_rgb=True).to_array().astype(int) - rgb).mean() < 8
+    whole = photo.path.read_bytes()
+    photo.path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="a.webp"):
+        read_ref(photo.path)
+
+
+def test_colmap_gets_files_that_it_can_read(tmp_path):
+    (tmp_path / "left").mkdir()
+    write_photo(tmp_path / "left" / "a.heic", textured(64, 48))
+    write_photo(tmp_path / "a.jpg", textured(64, 48))
+    images = list_images(tmp_path).images
+    with open_to_colmap(images, tmp_path) as folder:
+        found = [pycolmap.Bitmap.read(folder / image.name, as_rgb=True).to_array().astype(int) for image in images]
+    assert np.abs(found[0] - found[1]).mean() < 4
+    assert not folder.exists() and folder != tmp_path
+    with open_to_colmap(images[:1], tmp_path) as folder:
+        assert folder == tmp_path  # nothing to do

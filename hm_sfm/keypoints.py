@@ -5,7 +5,8 @@ by that patch's homography into the second; every keypoint of the second that is
 inverse; patches that hold no keypoint yet seed one at a well-localised pixel. A carried point joins a keypoint that
 is already there, or founds one. Afterwards tracks are formed, adjusted jointly and thinned to the budget.
 
-Coordinates within this module are px of the matching resolution ("units"); results are px of the stored images.
+Coordinates within this module are px of the matching resolution ("units"), or finer ones where a second fine pass
+made the keypoints sharper, see hm_sfm.sharpening; results are px of the stored images.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,11 +41,13 @@ class Photo:
     size_wh: tuple[int, int]
     """Px of the stored image."""
     px_per_unit: float
-    """Px of the stored image per px of the matching resolution."""
+    """Px of the stored image per unit."""
     seeds: np.ndarray
     """(N, 2) px of the stored image: well-localised points, best first."""
     hides: Callable[[np.ndarray], np.ndarray] | None = None
     """(N, 2) px of the stored image -> (N,) bool: where no keypoint may be, in masked pixels; None: nowhere."""
+    finer: float = 1.0
+    """Units per px of the matching resolution."""
 
     def allows(self, xy: np.ndarray) -> np.ndarray:
         """(N,) bool: whether keypoints may lie at xy, (N, 2) units: within the image and not masked."""
@@ -93,6 +96,16 @@ class Links:
     target: np.ndarray
     """(E,) int64, indices into the two images' keypoints."""
     carried: Carried
+
+
+@dataclass(frozen=True)
+class LinkedKeypoints:
+    """All keypoints, and what was predicted of them: tracks in the making."""
+
+    photos: tuple[Photo, ...]
+    xy: tuple[np.ndarray, ...]
+    """By photo, (K, 2) units."""
+    links: tuple[Links, ...]
 
 
 class GrowingKeypoints:
@@ -227,11 +240,25 @@ def persist_keypoints(
     config: KeypointConfig,
     quiet: bool = False,
 ) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
-    """Carry keypoints through all pairs, form tracks, adjust them and thin them out.
+    """Carry keypoints through all pairs, form tracks, adjust them and thin them out: link_keypoints, finish_keypoints.
+
+    Returns the Keypoints of every image, and the IndexMatches of every pair that shares tracks.
+    """
+    return finish_keypoints(link_keypoints(photos, ranked_pairs, read_verified, config, quiet), config)
+
+
+def link_keypoints(
+    photos: Sequence[Photo],
+    ranked_pairs: Sequence[ImagePair],
+    read_verified: Callable[[ImagePair], PairMatches],
+    config: KeypointConfig,
+    quiet: bool = False,
+) -> LinkedKeypoints:
+    """Seed keypoints and carry them through all pairs.
 
     photos: in the order of the result; ranked_pairs: strongest first, the first image of a pair (the one that
     seeds) is the one in more and stronger pairs; read_verified: the matches of a pair that agree with its two-view
-    geometry. Returns the Keypoints of every image, and the IndexMatches of every pair that shares tracks.
+    geometry.
     """
     index_of = {photo.name: i for i, photo in enumerate(photos)}
     growing = [GrowingKeypoints() for _ in photos]
@@ -250,7 +277,7 @@ def persist_keypoints(
         turn = strength[ends[1]] > strength[ends[0]]
         first, second = ends[::-1] if turn else ends
         links += walk_pair(first, second, carriers[::-1] if turn else carriers, photos, growing, seeds[first], config)
-    return finish_keypoints(photos, growing, links, config)
+    return LinkedKeypoints(tuple(photos), tuple(keypoints.xy for keypoints in growing), tuple(links))
 
 
 def walk_pair(
@@ -280,13 +307,17 @@ def walk_pair(
 
 
 def finish_keypoints(
-    photos: Sequence[Photo], growing: list[GrowingKeypoints], links: list[Links], config: KeypointConfig
+    linked: LinkedKeypoints, config: KeypointConfig
 ) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
-    """From links to consistent tracks, adjusted positions, and the keypoints that the budget keeps."""
-    counts = [len(g.xy) for g in growing]
+    """From links to consistent tracks, adjusted positions, and the keypoints that the budget keeps.
+
+    Returns the Keypoints of every image, and the IndexMatches of every pair that shares tracks.
+    """
+    photos, links = linked.photos, linked.links
+    counts = [len(xy) for xy in linked.xy]
     start = np.concatenate([[0], np.cumsum(counts)])
     image = np.repeat(np.arange(len(photos)), counts)
-    xy = np.concatenate([np.zeros((0, 2))] + [g.xy for g in growing])
+    xy = np.concatenate([np.zeros((0, 2)), *linked.xy])
     source = np.concatenate([np.zeros(0, np.int64)] + [start[link.source_image] + link.source for link in links])
     target = np.concatenate([np.zeros(0, np.int64)] + [start[link.target_image] + link.target for link in links])
     predicted = np.concatenate([np.zeros((0, 2))] + [link.carried.predicted for link in links])
@@ -305,14 +336,16 @@ def finish_keypoints(
         config.adjustment_rounds,
     )
     residual = measure_residuals(xy, moved, source, target, predicted, jacobian)
-    agreed = same & (residual <= config.join_radius_px)
+    finer = np.repeat([photo.finer for photo in photos], counts)
+    agreed = same & (residual <= config.join_radius_px * finer[target])
     label = label_tracks(len(xy), source[agreed], target[agreed], score[agreed], image)
 
     inside = [photo.allows(moved[a:b]) for photo, a, b in zip(photos, start[:-1], start[1:])]
     inside = np.concatenate([np.zeros(0, bool), *inside])
     length = measure_lengths(label)
     kept = inside & (length >= 2)
-    kept[kept] = choose_budget(label[kept], length[kept], sigma[kept], moved[kept], image[kept], config.max_keypoints)
+    spread = moved[kept] / finer[kept, None]
+    kept[kept] = choose_budget(label[kept], length[kept], sigma[kept], spread, image[kept], config.max_keypoints)
     new_index = np.cumsum(kept) - 1
     kept_start = np.concatenate([[0], np.cumsum(np.bincount(image[kept], minlength=len(photos)))])
 

@@ -3,18 +3,19 @@
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 
 from tqdm import tqdm
 
 from hm_sfm.errors import ConfigError, MissingPackageError
-from hm_sfm.images import prepare_image
+from hm_sfm.images import PreparedImage, prepare_image
 from hm_sfm.network.model import HomoMatcher, ImageFeatures
 from hm_sfm.schedule import order_pairs
 from hm_sfm.store import MatchStore
-from hm_sfm.types import ImagePair, ImageRef, PairMatches
+from hm_sfm.types import ImagePair, ImageRef, PairMatches, PatchMatches
+from hm_sfm.variants import UPRIGHT, Sketch, Variant, match_again, show_image
 
 BATCH_SECONDS = 20.0
 """Matches are stored at least this often: what a crash can lose."""
@@ -34,19 +35,28 @@ class FeatureCache:
     def __init__(self, images: Sequence[ImageRef], matcher: HomoMatcher, limit_mb: int, progress: tqdm) -> None:
         self.images = {image.name: image for image in images}
         self.matcher, self.limit_bytes, self.progress = matcher, limit_mb * 1_000_000, progress
-        self.cached: OrderedDict[str, ImageFeatures] = OrderedDict()
+        self.cached: OrderedDict[tuple[str, Variant | None], ImageFeatures | Sketch] = OrderedDict()
         self.seen: set[str] = set()
         self.seconds = 0.0
 
-    def get(self, name: str) -> ImageFeatures:
+    def get(self, name: str, variant: Variant = UPRIGHT) -> ImageFeatures:
         """Features of a photo. Raises InputError where it cannot be decoded."""
-        if name in self.cached:
-            self.cached.move_to_end(name)
-            return self.cached[name]
+        return self._keep(name, variant, lambda image: self.matcher.encode(show_image(image, variant)))
+
+    def sketch(self, name: str) -> Sketch:
+        """The sketch of a photo. Raises as get does."""
+        return self._keep(name, None, lambda image: Sketch(self.matcher, image))
+
+    def _keep(
+        self, name: str, variant: Variant | None, make: Callable[[PreparedImage], ImageFeatures | Sketch]
+    ) -> ImageFeatures | Sketch:
+        """What was made of a photo, or is now. variant: None for its sketch."""
+        key = (name, variant)
+        if key in self.cached:
+            self.cached.move_to_end(key)
+            return self.cached[key]
         started = time.monotonic()
-        prepared = prepare_image(self.images[name], self.matcher.images.long_edge_px)
-        features = self.matcher.encode(prepared)
-        self.cached[name] = features
+        made = self.cached[key] = make(prepare_image(self.images[name], self.matcher.images.long_edge_px))
         # Two photos are always held: a pair needs both.
         while len(self.cached) > 2 and sum(f.size_bytes for f in self.cached.values()) > self.limit_bytes:
             self.cached.popitem(last=False)
@@ -54,11 +64,22 @@ class FeatureCache:
         if name not in self.seen:
             self.seen.add(name)
             self.progress.update()
-        return features
+        return made
 
     def match(self, pair: ImagePair) -> PairMatches:
         """Match two photos. Raises ConfigError where their features alone exceed the limit."""
-        if pair.name1 in self.cached:
+        names = (pair.name0, pair.name1)
+        found = match_again(
+            self.matcher,
+            self._match_upright(pair),
+            lambda side, variant: self.get(names[side], variant),
+            lambda side: self.sketch(names[side]),
+        )
+        return PairMatches(pair=pair, **vars(found))
+
+    def _match_upright(self, pair: ImagePair) -> PatchMatches:
+        """The matches of two photos as they are. Raises as match does."""
+        if (pair.name1, UPRIGHT) in self.cached:
             self.get(pair.name1)  # it is not given up for the other
         features = self.get(pair.name0), self.get(pair.name1)
         size_bytes = sum(image.size_bytes for image in features)
@@ -67,7 +88,7 @@ class FeatureCache:
                 f"matching.feature_cache_mb is {self.limit_bytes // 1_000_000}, but {pair.name0} and {pair.name1} "
                 f"alone take {math.ceil(size_bytes / 1_000_000)} MB: allow more, or reduce images.long_edge_px"
             )
-        return PairMatches(pair=pair, **vars(self.matcher.match_features(*features)))
+        return self.matcher.match_features(*features)
 
 
 def check_engine(name: str) -> None:

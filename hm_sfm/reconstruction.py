@@ -25,7 +25,7 @@ from hm_sfm.diagnosis import Diagnosis, diagnose
 from hm_sfm.errors import InputError, NoModelError
 from hm_sfm.hloc import write_features, write_matches
 from hm_sfm.images import list_images, prepare_image
-from hm_sfm.keypoints import Photo, find_seeds, persist_keypoints
+from hm_sfm.keypoints import LinkedKeypoints, Photo, find_seeds, finish_keypoints, link_keypoints
 from hm_sfm.locks import lock_file, release_locks, wait_in_line
 from hm_sfm.mapping import choose_mapper, map_images, summarise_models
 from hm_sfm.masks import NO_MASKS, MaskedStore, Masks, read_masks
@@ -35,7 +35,9 @@ from hm_sfm.pairs import read_pairs, select_pairs, write_pairs
 from hm_sfm.report_figures import gather_report
 from hm_sfm.report_page import write_report
 from hm_sfm.retrieval import CellStore, describe_images, find_similar
+from hm_sfm.rigs import expand_pairs, read_rigs
 from hm_sfm.shards import Shard, merge_shards, refuse_shards
+from hm_sfm.sharpening import sharpen_links
 from hm_sfm.store import MatchStore, digest_image
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, MappingResult
 from hm_sfm.verification import VerifiedPair, verify_database, verify_pairs
@@ -226,8 +228,9 @@ def choose_pairs(
 ) -> tuple[ImagePair, ...]:
     """select_pairs for these photos. Where it must know which look alike, OUT is claimed and they are encoded into it.
 
-    shared: OUT, as in claim_folder. Raises what select_pairs, claim_folder and HomoMatcher.from_pretrained raise, and
-    InputError on an undecodable photo; those encoded by then stay encoded.
+    Of a sequence that rigs took, the photos of all their cameras are paired, see expand_pairs. shared: OUT, as in
+    claim_folder. Raises what select_pairs, claim_folder, HomoMatcher.from_pretrained, read_rigs and expand_pairs raise,
+    and InputError on an undecodable photo; those encoded by then stay encoded.
     """
     image_of = {image.name: image for image in images}
 
@@ -241,10 +244,15 @@ def choose_pairs(
         folder = Path(out) / "retrieval"
         with wait_in_line(folder / ".lock"):  # other shards find the photos encoded
             store = CellStore(folder, digest_weights(config.matching.model))
-            return find_similar(describe_images(photos, digests, matcher, store, quiet), top, gap)
+            turned = config.matching.retry_turned
+            return find_similar(describe_images(photos, digests, matcher, store, quiet, turned), top, gap)
 
     positions = {image.name: image.gps for image in images if image.gps}
-    return select_pairs([image.name for image in images], config.pairs, rank_by_looks, positions)
+    names = [image.name for image in images]
+    pairs = select_pairs(names, config.pairs, rank_by_looks, positions)
+    if config.cameras.rig and config.pairs.mode == "sequential":  # each camera of a rig is a sequence for itself
+        pairs = expand_pairs(pairs, read_rigs(Path(config.cameras.rig)), names, Path(config.cameras.rig))
+    return pairs
 
 
 def claim_folder(out: Path, shared: bool = False) -> None:
@@ -313,13 +321,29 @@ def carry_keypoints(
         for image in tqdm(images, desc="seeds", unit="image", disable=quiet)
     ]
     ranked = sorted(verified.values(), key=lambda found: (-found.strength, found.pair))
-    return persist_keypoints(
+    linked = link_keypoints(
         photos,
         [found.pair for found in ranked],
         lambda pair: store.read(pair).select(verified[pair].inliers),
         config.keypoints,
         quiet,
     )
+    if config.keypoints.native_px > config.images.long_edge_px:
+        linked = sharpen(linked, images, store.store if isinstance(store, MaskedStore) else store, config, quiet)
+    return finish_keypoints(linked, config.keypoints)
+
+
+def sharpen(
+    linked: LinkedKeypoints, images: Sequence[ImageRef], store: MatchStore, config: Config, quiet: bool
+) -> LinkedKeypoints:
+    """sharpen_links with the matcher of the configuration; what is done is kept beside the matches."""
+    matcher = HomoMatcher.from_pretrained(
+        config.matching.model, config=config.matching, images=config.images, network=config.network
+    )
+    native_px = config.keypoints.native_px
+    made_by = {**store.made_by, "keypoints.native_px": native_px}
+    path = store.path.with_name("native.h5")
+    return sharpen_links(linked, images, matcher, native_px, path, made_by, store.digests, quiet)
 
 
 def write_summary(

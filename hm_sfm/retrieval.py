@@ -21,6 +21,7 @@ from hm_sfm.config import fingerprint
 from hm_sfm.images import prepare_image
 from hm_sfm.network.model import HomoMatcher
 from hm_sfm.types import ImageRef
+from hm_sfm.variants import TURNS_DEG, Variant, show_image
 
 logger = logging.getLogger(__name__)
 
@@ -95,35 +96,61 @@ class CellStore:
 
 
 def describe_images(
-    images: Sequence[ImageRef], digests: Mapping[str, str], matcher: HomoMatcher, store: CellStore, quiet: bool = False
+    images: Sequence[ImageRef],
+    digests: Mapping[str, str],
+    matcher: HomoMatcher,
+    store: CellStore,
+    quiet: bool = False,
+    turned: bool = False,
 ) -> np.ndarray:
     """Global descriptors (N, D) float32 of unit length, none of it negative, in the order of the images.
 
-    digests: of the photos, by name. Photos that the store lacks are encoded into it, in batches. Raises InputError on
-    an undecodable photo; what was stored by then stays.
+    digests: of the photos, by name. turned: as they are and turned clockwise, by each of TURNS_DEG, (T, N, D): the words
+    are then those of all turns. Photos that the store lacks are encoded into it, in batches. Raises InputError on an
+    undecodable photo; what was stored by then stays.
     """
-    encode_images(images, digests, matcher, store, quiet)
-    keys = [digests[image.name] for image in images]
+    turns_deg = TURNS_DEG if turned else (0,)
+    encode_images(images, digests, matcher, store, quiet, turns_deg)
+    keys = [name_sample(digests[image.name], turn_deg) for turn_deg in turns_deg for image in images]
     vocabulary = learn_vocabulary(store.read(keys, max(1, VOCABULARY_CELLS // len(keys))))
-    return weigh_words(np.stack([count_words(cells, vocabulary) for cells in store.read(keys)]))
+    described = weigh_words(np.stack([count_words(cells, vocabulary) for cells in store.read(keys)]))
+    return described.reshape(len(turns_deg), len(images), -1) if turned else described
 
 
 def encode_images(
-    images: Sequence[ImageRef], digests: Mapping[str, str], matcher: HomoMatcher, store: CellStore, quiet: bool = False
+    images: Sequence[ImageRef],
+    digests: Mapping[str, str],
+    matcher: HomoMatcher,
+    store: CellStore,
+    quiet: bool = False,
+    turns_deg: Sequence[int] = (0,),
 ) -> None:
-    """Put a sample of the cells of each photo into the store, unless it is there."""
-    missing = {digests[image.name]: image for image in images if digests[image.name] not in store}
+    """Put a sample of the cells of each photo, turned clockwise by each angle, into the store, unless it is there."""
+    missing = {
+        digests[image.name]: image
+        for image in images
+        if any(name_sample(digests[image.name], turn_deg) not in store for turn_deg in turns_deg)
+    }
     batch: dict[str, np.ndarray] = {}
     stored_at = time.monotonic()
     try:
         for digest, image in tqdm(missing.items(), desc="retrieval", unit="image", disable=quiet or not missing):
-            cells = matcher.encode_plain(prepare_image(image, LONG_EDGE_PX)).cpu().numpy()
-            batch[digest] = sample_cells(cells)
+            prepared = prepare_image(image, LONG_EDGE_PX)
+            for turn_deg in turns_deg:
+                key = name_sample(digest, turn_deg)
+                if key not in store:
+                    cells = matcher.encode_plain(show_image(prepared, Variant(turn_deg))).cpu().numpy()
+                    batch[key] = sample_cells(cells)
             if time.monotonic() - stored_at > BATCH_SECONDS:
                 store.write(batch)
                 batch, stored_at = {}, time.monotonic()
     finally:
         store.write(batch)
+
+
+def name_sample(digest: str, turn_deg: int) -> str:
+    """The name in a CellStore of the sample of a turned photo; that of the photo as it is has its digest."""
+    return f"{digest}-{turn_deg}" if turn_deg else digest
 
 
 def sample_cells(cells: np.ndarray) -> np.ndarray:
@@ -159,13 +186,19 @@ def weigh_words(counts: np.ndarray) -> np.ndarray:
 def find_similar(descriptors: np.ndarray, top: int, gap: int = 0) -> np.ndarray:
     """For each descriptor the `top` most similar others that are more than `gap` rows away, best first.
 
-    descriptors: (N, D) float32, none of it negative. Returns (N, top) int64 rows, -1 where no more have anything in
-    common with it. Of equally similar ones the lower row comes first.
+    descriptors: (N, D) float32, none of it negative, or (T, N, D): each photo as it is, the first of T ways, is then
+    compared with the others in all ways, of which the most similar one counts. Returns (N, top) int64 rows, -1 where no
+    more have anything in common with it. Of equally similar ones the lower row comes first.
     """
+    turned = descriptors[1:] if descriptors.ndim == 3 else []
+    descriptors = descriptors[0] if descriptors.ndim == 3 else descriptors
     count = len(descriptors)
     found = np.full((count, top), -1, np.int64)
     for start in range(0, count, BLOCK_ROWS):
-        similarity = descriptors[start : start + BLOCK_ROWS] @ descriptors.T
+        block = descriptors[start : start + BLOCK_ROWS]
+        similarity = block @ descriptors.T
+        for others in turned:
+            np.maximum(similarity, block @ others.T, out=similarity)
         rows = np.arange(start, start + len(similarity))
         similarity[np.abs(rows[:, None] - np.arange(count)) <= gap] = 0
         best = np.argsort(-similarity, axis=1, kind="stable")[:, :top]

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from hm_sfm.network.aspan import Flow, SpanTransformer
 from hm_sfm.network.transformer import CoarseTransformer, encode_positions, place_positions
 
 BLOCK_ROWS = 64
@@ -96,6 +97,56 @@ class LoftrCoarse(CoarseTransformer):
         """Match described cells (N0, C) and (N1, C): confidence of at least `threshold`."""
         aware0, aware1 = self(coarse0[None], coarse1[None])
         return match_by_dual_softmax(aware0[0].float(), aware1[0].float(), threshold, self.sharpness)
+
+
+class AspanCoarse(SpanTransformer):
+    """ASpanFormer's coarse stage: attention within spans around a flow, dual softmax."""
+
+    def __init__(self, channels: int = 256, heads: int = 8, blocks: int = 4) -> None:
+        super().__init__(channels, heads, blocks)
+        # Learnt, where LoFTR and ASpanFormer keep it: features start at one size, whatever the backbone.
+        self.log_sharpness = nn.Parameter(torch.tensor(math.log(35.0 / channels)))
+
+    @property
+    def sharpness(self) -> Tensor:
+        """Factor of the inner products before the dual softmax, a scalar."""
+        return self.log_sharpness.exp()
+
+    def describe(self, coarse: Tensor) -> Tensor:
+        """(B, C, H, W) map of the backbone -> (B, C + 2, H, W) float32: features of unit variance with the positions
+        added, and the column and row of each cell, by which `forward` knows the grid.
+
+        The positions are relative to the image's size, which is what ASpanFormer's normalisation of them is for:
+        photos may be larger than those it was trained on.
+        """
+        batch, channels, height, width = coarse.shape
+        features = F.normalize(coarse.float(), dim=1) * channels**0.5
+        features = features + place_positions(channels, height, width, coarse.device)
+        row, column = torch.meshgrid(*(torch.arange(n, device=coarse.device) for n in (height, width)), indexing="ij")
+        place = torch.stack([column, row]).float().expand(batch, -1, -1, -1)
+        return torch.cat([features, place], dim=1)
+
+    def estimate(self, coarse0: Tensor, coarse1: Tensor) -> tuple[Tensor, Tensor, list[tuple[Flow, Flow]]]:
+        """Described cells (B, N0, C + 2), (B, N1, C + 2) -> features (B, N0, C), (B, N1, C), each aware of the other
+        image, and the flow of each block in both directions."""
+        map0, map1, flows = self.attend(*(as_map(cells) for cells in (coarse0, coarse1)))
+        return map0.flatten(2).transpose(1, 2), map1.flatten(2).transpose(1, 2), flows
+
+    def forward(self, coarse0: Tensor, coarse1: Tensor) -> tuple[Tensor, Tensor]:
+        """The features alone, as in `estimate`."""
+        return self.estimate(coarse0, coarse1)[:2]
+
+    def match(self, coarse0: Tensor, coarse1: Tensor, threshold: float) -> Matches:
+        """Match described cells (N0, C + 2) and (N1, C + 2), each all of its image: confidence of at least
+        `threshold`."""
+        aware0, aware1 = self(coarse0[None], coarse1[None])
+        return match_by_dual_softmax(aware0[0].float(), aware1[0].float(), threshold, self.sharpness)
+
+
+def as_map(cells: Tensor) -> Tensor:
+    """(B, H W, C + 2), the last two being each cell's column and row -> (B, C, H, W)."""
+    rows = int(cells[0, -1, -1]) + 1
+    return cells[:, :, :-2].transpose(1, 2).unflatten(2, (rows, -1))
 
 
 def match_by_similarity(coarse0: Tensor, coarse1: Tensor, threshold: float, block: int = BLOCK_ROWS) -> Matches:

@@ -41,14 +41,15 @@ def make_fine_map(fine: Tensor) -> FineMap:
     return FineMap(F.pad(fine.flatten(2).transpose(1, 2), (0, 0, 0, 1)), (width, height))
 
 
-def gather_patches(fine: FineMap, image_index: Tensor, centre: Tensor, side: int) -> Tensor:
+def gather_patches(fine: FineMap, image_index: Tensor, centre: Tensor, side: int, spacing: int = 1) -> Tensor:
     """Cut square patches out of fine features; cells outside the map are zero.
 
-    image_index: (P,) int64; centre: (P, 2) int64 cells (x, y); side: odd. Returns (P, side * side, C), row by row.
+    image_index: (P,) int64; centre: (P, 2) int64 cells (x, y); side: odd, so many cells, each `spacing` from the next.
+    Returns (P, side * side, C), row by row.
     """
     width, height = fine.size_wh
     cells = width * height
-    steps = torch.arange(-(side // 2), side // 2 + 1, device=centre.device)
+    steps = spacing * torch.arange(-(side // 2), side // 2 + 1, device=centre.device)
     x, y = (centre[:, :, None] + steps).unbind(dim=1)
     # Out of range in either direction, the sum is at least `cells`, and clamps to the row of zeros.
     x = torch.where((x >= 0) & (x < width), x, cells)
@@ -108,15 +109,18 @@ class HomographyHead(nn.Module):
     """The paper's fine module (section 3.2): K residual updates of the corner displacements.
 
     window: w, side of the patch of A, 2**n + 1. margin: cells by which the patch of B is larger on each side (the
-    paper: 0), so that points moved beyond w x w still see features. radius: r of the sampled windows.
+    paper: 0), so that points moved beyond w x w still see features. radius: r of the sampled windows. spacing: a power
+    of 2, at most (w - 1) / 2: of the patch of A, only cells so far from each other are looked up in B (the paper: 1).
     """
 
-    def __init__(self, window: int, radius: int, iterations: int, margin: int) -> None:
+    def __init__(self, window: int, radius: int, iterations: int, margin: int, spacing: int = 1) -> None:
         super().__init__()
         self.window, self.radius, self.iterations, self.margin = window, radius, iterations, margin
+        self.spacing, self.side = spacing, (window - 1) // spacing + 1
         channels = 2 * (2 * radius + 1) ** 2 + 4
-        layers: list[nn.Module] = [nn.Conv2d(channels, 64, 3, padding=1), nn.ReLU(inplace=True)]
-        width, side = 64, window
+        # Fewer points take less time each, so they may have wider layers.
+        width, side = 64 if spacing == 1 else 96, self.side
+        layers: list[nn.Module] = [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
         while side > 3:
             layers += [nn.Conv2d(width, width + 32, 3, stride=2, padding=1), nn.ReLU(inplace=True)]
             width, side = width + 32, (side + 1) // 2
@@ -126,7 +130,7 @@ class HomographyHead(nn.Module):
         for layer in (self.corners, self.scale):
             nn.init.normal_(layer.weight, std=1e-3)
             nn.init.zeros_(layer.bias)
-        self.register_buffer("grid", make_patch_grid((window - 1) / 2), persistent=False)
+        self.register_buffer("grid", make_patch_grid((window - 1) / 2, spacing), persistent=False)
         self.register_buffer("pooling", make_pooling(window + 2 * margin), persistent=False)
 
     @property
@@ -149,7 +153,7 @@ class HomographyHead(nn.Module):
         float32 cells, displacements of the corners to start from, None for the paper's identity. Returns the
         FineEstimate of each iteration.
         """
-        patch0 = gather_patches(fine0, image_index, cell0, self.window)
+        patch0 = gather_patches(fine0, image_index, cell0, self.side, self.spacing)
         patch1 = gather_patches(fine1, image_index, cell1, self.window + 2 * self.margin)
         # A last row of zero features makes the zero that sample_windows takes outside the maps.
         full = correlate_patches(patch0, F.pad(patch1, (0, 0, 0, 1)))
@@ -179,7 +183,7 @@ class HomographyHead(nn.Module):
                 grid.reshape(-1, 2).T.to(full.dtype),
             ]
         )
-        maps = samples.T.reshape(len(target), self.window, self.window, len(samples)).permute(0, 3, 1, 2)
+        maps = samples.T.reshape(len(target), self.side, self.side, len(samples)).permute(0, 3, 1, 2)
         code = self.encoder(maps)
         # A bounded step: unbounded ones fold patches over early in training, and never recover.
         residual = self.half * torch.tanh(self.corners(code).float())

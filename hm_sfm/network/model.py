@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import math
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,13 @@ from hm_sfm.coordinates import Grid
 from hm_sfm.errors import ConfigError, WeightsError
 from hm_sfm.images import PreparedImage, prepare_array, prepare_image, read_ref
 from hm_sfm.network.backbone import LightBackbone
-from hm_sfm.network.coarse import AttentionCoarse, CosineCoarse, LoftrCoarse
+from hm_sfm.network.coarse import AspanCoarse, AttentionCoarse, CosineCoarse, LoftrCoarse
 from hm_sfm.network.fine import ExpectationHead, FineMap, HomographyHead, make_fine_map
 from hm_sfm.network.growth import GridMatches, PatchGrid, grow_matches
 from hm_sfm.network.homography import is_regular, make_corners
 from hm_sfm.network.resnet import LoftrBackbone
 from hm_sfm.types import ImageRef, PatchMatches
+from hm_sfm.variants import Sketch, match_again, show_image
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 FINE_CHUNK = 512
@@ -49,18 +51,26 @@ class HomoNet(nn.Module):
         for field, least in (("radius", 0), ("iterations", 1), ("margin", 0)):
             if getattr(config, field) < least:
                 raise ConfigError(f"network.{field} must be at least {least}, found {getattr(config, field)}")
+        spacing = config.spacing
+        if spacing < 1 or spacing & (spacing - 1) or spacing > (config.window - 1) // 2:
+            raise ConfigError(
+                f"network.spacing must be a power of 2 up to {(config.window - 1) // 2}, half of network.window, found "
+                f"{spacing}"
+            )
         if config.backbone not in ("light", "loftr"):
             raise ConfigError(f"network.backbone must be light or loftr, found {config.backbone!r}")
         light = config.backbone == "light"
         self.backbone = LightBackbone() if light else LoftrBackbone()
         if config.coarse == "attention":
             self.coarse = AttentionCoarse() if light else LoftrCoarse()
+        elif config.coarse == "aspan":
+            self.coarse = AspanCoarse(channels=64, heads=4, blocks=2) if light else AspanCoarse()
         elif config.coarse == "cosine":
             self.coarse = CosineCoarse()
         else:
-            raise ConfigError(f"network.coarse must be attention or cosine, found {config.coarse!r}")
+            raise ConfigError(f"network.coarse must be attention, aspan or cosine, found {config.coarse!r}")
         if config.head == "homography":
-            self.head = HomographyHead(config.window, config.radius, config.iterations, config.margin)
+            self.head = HomographyHead(config.window, config.radius, config.iterations, config.margin, spacing)
         elif config.head == "expectation":
             self.head = ExpectationHead(config.window, config.margin)
         else:
@@ -144,8 +154,13 @@ class HomoMatcher:
 
         Coordinates are px of the images as stored. Raises InputError on an unreadable image.
         """
-        features0, features1 = (self.encode(self._prepare(image)) for image in (image0, image1))
-        return self.match_features(features0, features1)
+        images = [self._prepare(image) for image in (image0, image1)]
+        return match_again(
+            self,
+            self.match_features(*(self.encode(image) for image in images)),
+            lambda side, variant: self.encode(show_image(images[side], variant)),
+            lambda side: Sketch(self, images[side]),
+        )
 
     def _prepare(self, image: str | Path | np.ndarray) -> PreparedImage:
         if isinstance(image, np.ndarray):
@@ -183,6 +198,27 @@ class HomoMatcher:
         return F.normalize(coarse[0, :, :rows, :columns].flatten(1).T.float(), dim=1)
 
     @torch.inference_mode()
+    def encode_coarse(self, image: PreparedImage) -> Tensor:
+        """(H, W, C) float32: the cells of ImageFeatures.coarse on their grid, without the rest."""
+        backbone = self.net.backbone
+        pixels = pad_image(torch.tensor(image.grey, device=self.device), backbone.stride, backbone.standardised)
+        columns, rows = (count_cells(size, backbone.coarse_grid) for size in image.scaled_wh)
+        with autocast(self.device):
+            coarse = self.net.coarse.describe(backbone(pixels, want_fine=False).coarse[:, :, :rows, :columns])
+        return coarse[0].permute(1, 2, 0).contiguous()
+
+    @torch.inference_mode()
+    def match_coarse(self, coarse0: Tensor, coarse1: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """Cells of two images that the network's own coarse stage matches: (M,) int64 of each, counted row by row.
+
+        coarse0, coarse1: as encode_coarse makes them.
+        """
+        cells = (coarse.flatten(0, 1) for coarse in (coarse0, coarse1))
+        with autocast(self.device):
+            index0, index1, _ = self.net.coarse.match(*cells, self.config.coarse_threshold)
+        return index0.cpu().numpy(), index1.cpu().numpy()
+
+    @torch.inference_mode()
     def match_features(self, features0: ImageFeatures, features1: ImageFeatures) -> PatchMatches:
         """Match two images by their features; coordinates are px of the stored images."""
         backbone, head = self.net.backbone, self.net.head
@@ -191,18 +227,7 @@ class HomoMatcher:
         cell1, rest1 = round_to_cells(coarse.xy1, backbone.fine_grid)
         cell0, cell1 = cell0.to(self.device), cell1.to(self.device)
 
-        def refine(cell0: Tensor, cell1: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor]:
-            homography, log_scale = [torch.zeros(0, 3, 3, device=self.device)], [torch.zeros(0, device=self.device)]
-            for first in range(0, len(cell0), FINE_CHUNK):
-                chunk = slice(first, first + FINE_CHUNK)
-                image = torch.zeros(len(cell0[chunk]), dtype=torch.int64, device=self.device)
-                begin = {} if start is None else {"start": start[chunk]}
-                with autocast(self.device):
-                    estimate = head(features0.fine, features1.fine, image, cell0[chunk], cell1[chunk], **begin)[-1]
-                homography.append(estimate.homography)
-                log_scale.append(estimate.log_scale)
-            return torch.cat(homography), torch.cat(log_scale)
-
+        refine = partial(self.estimate_patches, features0.fine, features1.fine)
         start = None
         if isinstance(head, HomographyHead):
             start = make_start(rest0, rest1, coarse.linear, head.half).to(self.device)
@@ -219,6 +244,24 @@ class HomoMatcher:
             homography, log_scale, rest0 = found.homography, found.log_scale, np.zeros((len(cell0), 2))
         regular = is_regular(homography, head.half).cpu().numpy()
         return self._to_stored(features0, features1, cell0, rest0, cell1, homography, log_scale, regular)
+
+    def estimate_patches(
+        self, fine0: FineMap, fine1: FineMap, cell0: Tensor, cell1: Tensor, start: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """The head's last word on P patches, some at a time: homographies (P, 3, 3) and logs of error scales (P,).
+
+        cell0, cell1: (P, 2) int64 fine cells; start: (P, 4, 2) cells, as in HomographyHead.forward.
+        """
+        homography, log_scale = [torch.zeros(0, 3, 3, device=self.device)], [torch.zeros(0, device=self.device)]
+        for first in range(0, len(cell0), FINE_CHUNK):
+            chunk = slice(first, first + FINE_CHUNK)
+            image = torch.zeros(len(cell0[chunk]), dtype=torch.int64, device=self.device)
+            begin = {} if start is None else {"start": start[chunk]}
+            with autocast(self.device):
+                estimate = self.net.head(fine0, fine1, image, cell0[chunk], cell1[chunk], **begin)[-1]
+            homography.append(estimate.homography)
+            log_scale.append(estimate.log_scale)
+        return torch.cat(homography), torch.cat(log_scale)
 
     def _to_stored(self, features0, features1, cell0, rest0, cell1, homography, log_scale, regular) -> PatchMatches:
         """From patch coordinates to px of the stored images; drops irregular patches and those out of an image.
@@ -358,6 +401,8 @@ def load_weights(name: str, network: NetworkConfig | None = None) -> HomoNet:
         check_digest(path)
     content = read_checkpoint(path)
     if "network" not in content and network is not None and network.backbone == "loftr":
+        if network.coarse == "aspan":
+            raise WeightsError(f"{path} has no coarse stage for network.coarse aspan: train one with hm-sfm train")
         if network.head != "expectation":
             raise WeightsError(
                 f"{path} has no homography head: train one with hm-sfm train, or take network.head expectation"
@@ -383,13 +428,15 @@ def load_weights(name: str, network: NetworkConfig | None = None) -> HomoNet:
 
 
 def load_loftr(net: HomoNet, path: Path) -> None:
-    """Put backbone and coarse stage of a public LoFTR checkpoint into a `loftr` network, by name.
+    """Put backbone and coarse stage of a public LoFTR checkpoint into a `loftr` network, by name; the backbone alone where
+    the coarse stage is ASpanFormer's.
 
     Raises WeightsError where the file is damaged, or keys are missing or of another shape.
     """
     content = read_checkpoint(path)
     source = {key.removeprefix("matcher."): value for key, value in content.get("state_dict", content).items()}
-    for part, prefix in ((net.backbone, "backbone."), (net.coarse, "loftr_coarse.")):
+    parts = [(net.backbone, "backbone."), (net.coarse, "loftr_coarse.")]
+    for part, prefix in parts[:1] if isinstance(net.coarse, AspanCoarse) else parts:
         fit_state(
             part, {key.removeprefix(prefix): value for key, value in source.items() if key.startswith(prefix)}, path
         )

@@ -202,7 +202,7 @@ def check_config(config: TrainConfig) -> None:
         if getattr(config, name) < 1:
             raise ConfigError(f"{name} must be at least 1, found {getattr(config, name)}")
     if config.stage != "fine" and config.network.coarse == "cosine":
-        raise ConfigError("network.coarse cosine has nothing to train: take attention, or stage fine")
+        raise ConfigError("network.coarse cosine has nothing to train: take attention or aspan, or stage fine")
     shares = (config.rendered_share, config.real_share, config.megadepth_share)
     if min(shares) < 0 or sum(shares) > 1 + 1e-9:
         raise ConfigError(

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from hm_sfm.network.aspan import Flow
 from hm_sfm.network.fine import FineEstimate
 from hm_sfm.network.homography import apply_homography, is_regular, make_patch_grid
 from hm_sfm.training.supervision import CoarseSupervision, PatchSupervision, PointSupervision
@@ -22,6 +23,8 @@ UNBOUNDED_SHARE = 0.1
 """Of -log P in the coarse loss."""
 COARSE_MATCHES = 1000
 """Supervised per pair; more of them say little new."""
+FLOW_WEIGHT = 0.1
+"""Of the flows' likelihood beside the coarse loss, as in ASpanFormer."""
 LARGEST_ERROR = 8.0
 """Cells: what the error scale of a wrong match is taught."""
 
@@ -100,3 +103,25 @@ def measure_coarse_loss(coarse0: Tensor, coarse1: Tensor, sharpness: Tensor, tru
             bounded = (1 - torch.exp(COARSE_TRUNCATION * confidence)) / COARSE_TRUNCATION
             losses.append(torch.lerp(bounded, -confidence, UNBOUNDED_SHARE).mean())
     return torch.stack(losses).mean() if losses else coarse0.sum() * 0
+
+
+def measure_flow_loss(flows: list[tuple[Flow, Flow]], truth: CoarseSupervision) -> Tensor:
+    """How unlikely the true matches are under the flows of ASpanFormer's blocks (L_flow, section 3 of its paper): the
+    negative log-likelihood, without its constant, summed over both axes; mean over matches, directions and blocks, a
+    scalar; 0 without matches.
+
+    flows: of each block, from image 0 to image 1 and back. The centre of the true match's cell stands for the truth: it
+    is half a cell off at most.
+    """
+    losses = []
+    for flow0, flow1 in flows:
+        for flow, other, own_index, other_index in (
+            (flow0, flow1, truth.index0, truth.index1),
+            (flow1, flow0, truth.index1, truth.index0),
+        ):
+            columns = other.centre.shape[3]
+            true = torch.stack([other_index % columns, other_index // columns], dim=1)
+            centre, log_sigma = (x.flatten(2)[truth.image_index, :, own_index] for x in (flow.centre, flow.log_sigma))
+            surprise = log_sigma + 0.5 * ((true - centre) * torch.exp(-log_sigma)).square()
+            losses.append(surprise.sum() / max(len(true), 1))
+    return torch.stack(losses).mean()

@@ -7,10 +7,19 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 from torch import Tensor
 
+from hm_sfm.network.aspan import Flow
 from hm_sfm.network.backbone import FeatureMaps
+from hm_sfm.network.coarse import AspanCoarse
 from hm_sfm.network.fine import FineEstimate, make_fine_map
 from hm_sfm.network.model import HomoNet
-from hm_sfm.training.losses import measure_coarse_loss, measure_errors, measure_loss, measure_point_loss
+from hm_sfm.training.losses import (
+    FLOW_WEIGHT,
+    measure_coarse_loss,
+    measure_errors,
+    measure_flow_loss,
+    measure_loss,
+    measure_point_loss,
+)
 from hm_sfm.training.supervision import (
     JITTERED_SHARE,
     CoarseSupervision,
@@ -34,11 +43,16 @@ def run_backbone(net: HomoNet, images: Tensor, want_fine: bool) -> FeatureMaps:
     return net.backbone(pixels.flatten(0, 1)[:, None], want_fine)
 
 
-def run_coarse(net: HomoNet, maps: FeatureMaps) -> tuple[Tensor, Tensor]:
-    """(B, N, C) float32 of both views: cells as the coarse stage compares them."""
+def run_coarse(net: HomoNet, maps: FeatureMaps) -> tuple[Tensor, Tensor, list[tuple[Flow, Flow]]]:
+    """(B, N, C) float32 of both views: cells as the coarse stage compares them; and the flows, from A to B and back, by
+    which it found them, none where it works without."""
     described = net.coarse.describe(maps.coarse).flatten(2).transpose(1, 2).unflatten(0, (-1, 2))
-    coarse0, coarse1 = net.coarse(described[:, 0], described[:, 1])
-    return coarse0.float(), coarse1.float()
+    flows = []
+    if isinstance(net.coarse, AspanCoarse):
+        coarse0, coarse1, flows = net.coarse.estimate(described[:, 0], described[:, 1])
+    else:
+        coarse0, coarse1 = net.coarse(described[:, 0], described[:, 1])
+    return coarse0.float(), coarse1.float(), flows
 
 
 def run_fine(net: HomoNet, maps: FeatureMaps, truth: PatchSupervision | PointSupervision) -> list[FineEstimate]:
@@ -66,7 +80,7 @@ def measure_objective(
         parts = {"loss": torch.zeros((), device=device)}
         if stage != "fine":
             truth = to_device(supervise_coarse(net, batch), device)
-            coarse0, coarse1 = run_coarse(net, maps)
+            coarse0, coarse1, flows = run_coarse(net, maps)
         if stage != "coarse":
             patches = to_device(supervise_fine(net, batch, patches_per_pair, generator, jittered_share), device)
             points = to_device(supervise_points(net, batch, patches_per_pair, generator, jittered_share), device)
@@ -75,6 +89,9 @@ def measure_objective(
     if stage != "fine":
         parts["coarse"] = measure_coarse_loss(coarse0, coarse1, net.coarse.sharpness, truth)
         parts["loss"] = parts["loss"] + parts["coarse"]
+        if flows:
+            parts["flow"] = measure_flow_loss(flows, truth)
+            parts["loss"] = parts["loss"] + FLOW_WEIGHT * parts["flow"]
     if stage != "coarse":
         fine = measure_loss(estimates, patches, net.head.half, dense=supervise != "centre")
         fine["point"] = measure_point_loss(point_estimates, points, net.head.half)

@@ -5,7 +5,7 @@ import torch
 
 from hm_sfm.config import NetworkConfig
 from hm_sfm.errors import ConfigError
-from hm_sfm.network.fine import ExpectationHead, HomographyHead, make_fine_map
+from hm_sfm.network.fine import ExpectationHead, HomographyHead, gather_patches, make_fine_map
 from hm_sfm.network.homography import apply_homography, make_corners
 from hm_sfm.network.model import HomoNet
 from hm_sfm.training.losses import measure_loss
@@ -26,10 +26,13 @@ def make_cells(size: int) -> torch.Tensor:
     return torch.stack([x, y], dim=-1)
 
 
-@pytest.mark.parametrize("window, radius, iterations, margin", [(9, 1, 3, 2), (5, 1, 1, 0), (17, 3, 2, 0)])
-def test_homography_head_gives_one_estimate_per_iteration(window, radius, iterations, margin):
+@pytest.mark.parametrize(
+    "window, radius, iterations, margin, spacing",
+    [(9, 1, 3, 2, 1), (5, 1, 1, 0, 1), (17, 3, 2, 0, 1), (9, 1, 2, 2, 2), (9, 0, 1, 2, 4), (5, 1, 1, 2, 2)],
+)
+def test_homography_head_gives_one_estimate_per_iteration(window, radius, iterations, margin, spacing):
     torch.manual_seed(0)
-    head = HomographyHead(window, radius, iterations, margin)
+    head = HomographyHead(window, radius, iterations, margin, spacing)
     fine = make_fine_map(torch.randn(2, 48, 24, 32))
     cell = torch.tensor([[5, 5], [0, 0], [31, 23]])
     estimates = head(fine, fine, torch.tensor([0, 1, 1]), cell, cell)
@@ -40,6 +43,13 @@ def test_homography_head_gives_one_estimate_per_iteration(window, radius, iterat
         assert estimate.log_scale.shape == (3,)
         assert all(t.isfinite().all() for t in (estimate.displacement, estimate.homography, estimate.log_scale))
         assert all(t.dtype == torch.float32 for t in (estimate.displacement, estimate.homography))
+
+
+def test_spaced_patches_are_every_second_cell_of_the_whole():
+    fine = make_fine_map(torch.randn(1, 48, 12, 12))
+    index, cell = torch.tensor([0, 0]), torch.tensor([[6, 5], [1, 11]])
+    whole = gather_patches(fine, index, cell, 9).view(2, 9, 9, 48)
+    torch.testing.assert_close(gather_patches(fine, index, cell, 5, 2).view(2, 5, 5, 48), whole[:, ::2, ::2])
 
 
 def test_an_untrained_homography_head_starts_near_the_identity():
@@ -75,8 +85,12 @@ def test_expectation_head_is_unsure_of_a_flat_patch():
 
 @pytest.mark.parametrize("head", ["homography", "expectation"])
 @pytest.mark.parametrize(
-    "field, value", [("window", 8), ("window", 3), ("radius", -1), ("iterations", 0), ("margin", -1)]
-)
+    "field, value",
+    [
+        ("window", 8), ("window", 3), ("radius", -1), ("iterations", 0), ("margin", -1), ("spacing", 0),
+        ("spacing", 3), ("spacing", 8),
+    ],
+)  # fmt: skip
 def test_impossible_networks_are_refused(head, field, value):
     with pytest.raises(ConfigError, match=f"network.{field}"):
         HomoNet(NetworkConfig(**{"head": head, field: value}))
@@ -88,7 +102,8 @@ def test_unknown_parts_are_refused(field):
         HomoNet(NetworkConfig(**{field: "heavy"}))
 
 
-def test_homography_head_learns_a_small_warp():
+@pytest.mark.parametrize("spacing", [1, 2])
+def test_homography_head_learns_a_small_warp(spacing):
     """The features are exact functions of position, so what is left to learn is to read the correlations."""
     torch.manual_seed(0)
     waves, size = make_waves(48, 16), 48
@@ -102,7 +117,7 @@ def test_homography_head_learns_a_small_warp():
     cell_b = in_b.round().long() + torch.randint(-2, 3, (count, 2))
     homography = b_from_a.repeat(count, 1, 1)
     homography[:, :2, 2] = in_b - cell_b
-    head = HomographyHead(9, 1, 2, 2)
+    head = HomographyHead(9, 1, 2, 2, spacing)
     displacement = apply_homography(homography, make_corners(head.half)) - make_corners(head.half)
     index = torch.zeros(count, dtype=torch.int64)
     truth = PatchSupervision(index, cell_a, cell_b, homography, displacement, torch.ones(count, dtype=torch.bool))

@@ -1,16 +1,15 @@
 """Which photos look alike: descriptors from cells, the nearest ones, and the samples of cells on disk."""
 
-from types import SimpleNamespace
-
+import cv2
 import h5py
 import numpy as np
 import pytest
 import torch
 
 import hm_sfm.retrieval as retrieval
-from hm_sfm.config import Config, ImageConfig, NetworkConfig, PairConfig
+from hm_sfm.config import Config, ImageConfig, MatchingConfig, NetworkConfig, PairConfig
 from hm_sfm.errors import InputError
-from hm_sfm.images import prepare_array
+from hm_sfm.images import CV_ROTATIONS, prepare_array, read_ref
 from hm_sfm.network.model import HomoMatcher, HomoNet
 from hm_sfm.pairs import select_pairs
 from hm_sfm.reconstruction import choose_pairs
@@ -24,6 +23,7 @@ from hm_sfm.retrieval import (
     sample_cells,
     weigh_words,
 )  # fmt: skip
+from hm_sfm.textures import make_texture
 from hm_sfm.types import ImageRef
 
 CHANNELS = 16
@@ -209,6 +209,33 @@ def test_flat_photos_resemble_each_other_and_no_others(ring, tmp_path):
     assert find_similar(descriptors, 2)[:3].tolist() == [[1, 2], [0, 2], [0, 1]]
 
 
+def test_turned_photos_are_found(tmp_path):
+    """Textures, each seen twice: as it is, and turned."""
+    matcher = HomoMatcher.from_pretrained("light")
+    rng = np.random.default_rng(0)
+    for i, material in enumerate(("bricks", "stones", "planks", "mural")):
+        texture = make_texture(rng, material, (1.6, 1.2), 100)
+        turned = cv2.rotate(texture[4:, 7:], CV_ROTATIONS[(90, 180, 270, 90)[i]])
+        for name, photo in ((f"{i}.png", texture), (f"{i + 4}.png", turned)):
+            cv2.imwrite(str(tmp_path / name), photo)
+    images = [read_ref(tmp_path / f"{i}.png") for i in range(8)]
+    digests, store = {image.name: image.name for image in images}, CellStore(tmp_path / "cells", "a")
+    upright = describe_images(images, digests, matcher, store, quiet=True)
+    turned = describe_images(images, digests, matcher, store, quiet=True, turned=True)
+    assert turned.shape[:2] == (4, 8) and turned.dtype == np.float32
+    expected = [4, 5, 6, 7, 0, 1, 2, 3]
+    assert find_similar(turned, 1).ravel().tolist() == expected != find_similar(upright, 1).ravel().tolist()
+
+
+def test_of_all_turns_the_most_similar_one_counts():
+    one, other = np.eye(2, dtype=np.float32)
+    descriptors = np.stack([one, one, other])
+    turned = np.stack([descriptors, np.stack([other, 0.6 * one + 0.8 * other, one])])
+    assert find_similar(turned, 2).tolist() == [[1, 2], [0, 2], [0, 1]]
+    assert find_similar(descriptors, 2).tolist() == [[1, -1], [0, -1], [-1, -1]]
+    assert find_similar(turned[:, :0], 2).shape == (0, 2)
+
+
 def test_photos_with_nothing_in_common_are_in_no_pair():
     with pytest.raises(InputError, match="finds no pair among 3 images"):
         select_pairs(["a", "b", "c"], PairConfig(mode="retrieval"), lambda *ask: find_similar(np.eye(3), *ask[1:]))
@@ -265,7 +292,8 @@ def test_choosing_pairs_encodes_only_where_looks_matter(ring, tmp_path, monkeypa
     monkeypatch.setattr("hm_sfm.reconstruction.digest_image", lambda image: ring.digests[image.name])
     exhaustive = choose_pairs(ring.images, tmp_path / "out", Config(), quiet=True)
     assert len(exhaustive) == 60 * 59 // 2 and not asked and not (tmp_path / "out").exists()
-    config = Config(pairs=PairConfig(mode="retrieval", retrieval_top=4))
+    pairing, matching = PairConfig(mode="retrieval", retrieval_top=4), MatchingConfig(retry_turned=False)
+    config = Config(pairs=pairing, matching=matching)
     pairs = choose_pairs(ring.images, tmp_path / "out", config, quiet=True)
     assert 120 <= len(pairs) <= 240 and len(ring.encoded) == 60
     assert (tmp_path / "out" / ".hm_sfm").exists() and (tmp_path / "out" / "retrieval").is_dir()
@@ -277,6 +305,6 @@ def test_choosing_pairs_by_position(tmp_path):
     images = [
         ImageRef(f"{i}.jpg", tmp_path, (64, 64), 0, (48.0, 8.5 + i * 1e-5, 100.0) if i else None) for i in range(4)
     ]
-    config = SimpleNamespace(pairs=PairConfig(mode="spatial"))
+    config = Config(pairs=PairConfig(mode="spatial"))
     pairs = choose_pairs(images, tmp_path / "out", config, quiet=True)
     assert {name for pair in pairs for name in (pair.name0, pair.name1)} == {"1.jpg", "2.jpg", "3.jpg"}

@@ -1,0 +1,215 @@
+"""The second fine pass, on a textured plane whose true homography is known."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from hm_sfm import sharpening
+from hm_sfm.config import ImageConfig, KeypointConfig, MatchingConfig
+from hm_sfm.coordinates import homography_to_pixel_index
+from hm_sfm.errors import ConfigError
+from hm_sfm.images import prepare_image, read_ref
+from hm_sfm.keypoints import Carried, LinkedKeypoints, Links, Photo, differentiate, finish_keypoints
+from hm_sfm.network.fine import ExpectationHead
+from hm_sfm.network.model import HomoMatcher
+from hm_sfm.sharpening import encode_native, fit_variants, sharpen_links
+from hm_sfm.store import digest_image
+from hm_sfm.types import apply_homographies
+
+SIZE_WH = (768, 576)
+UNIT = 3.0
+"""Px of the photos per px of the matching resolution."""
+B_FROM_A = np.array([[1.02, -0.06, 14.0], [0.05, 0.99, -9.0], [2e-5, 1e-5, 1.0]])
+NOISE_PX = 1.0
+
+
+def true_xy(homography: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    return apply_homographies(np.tile(homography, (len(xy), 1, 1)), xy).astype(np.float64)
+
+
+@pytest.fixture(scope="module")
+def matcher() -> HomoMatcher:
+    images = ImageConfig(long_edge_px=round(SIZE_WH[0] / UNIT))
+    return HomoMatcher.from_pretrained("light", config=MatchingConfig(device="cpu"), images=images)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    """a.png and b.png, which sees it by B_FROM_A."""
+    folder = tmp_path_factory.mktemp("photos")
+    rng = np.random.default_rng(0)
+    texture = sum(
+        cv2.resize(rng.random((SIZE_WH[1] // cell, SIZE_WH[0] // cell)), SIZE_WH, interpolation=cv2.INTER_CUBIC) * cell
+        for cell in (4, 8, 16, 48)
+    )
+    texture = (255 * (texture - texture.min()) / np.ptp(texture)).astype(np.uint8)
+    warped = cv2.warpPerspective(texture, homography_to_pixel_index(B_FROM_A), SIZE_WH, flags=cv2.INTER_CUBIC)
+    for name, image in (("a", texture), ("b", warped)):
+        assert cv2.imwrite(str(folder / f"{name}.png"), image)
+    return [read_ref(folder / f"{name}.png") for name in "ab"]
+
+
+def link_photos(photos, wrong: int = 0) -> LinkedKeypoints:
+    """Keypoints of both photos, half carried onward and half back, off by NOISE_PX; `wrong` ones by 40 px."""
+    rng = np.random.default_rng(1)
+    x, y = np.meshgrid(np.arange(80, 690, 30.0), np.arange(80, 500, 30.0))
+    xy_a = np.stack([x.ravel(), y.ravel()], axis=1) + rng.uniform(-4, 4, (x.size, 2))
+    xy_b = true_xy(B_FROM_A, xy_a)
+    half = len(xy_a) // 2
+    noise = rng.normal(0, NOISE_PX, xy_a.shape)
+    noise[:wrong] = 40.0
+    index = np.arange(len(xy_a))
+    onward, back = index[:half], index[half:]
+    known = [np.concatenate([xy_a[:half], (xy_a + noise)[half:]]), np.concatenate([(xy_b + noise)[:half], xy_b[half:]])]
+
+    def link(source, target, chosen, homography) -> Links:
+        jacobian = differentiate(np.tile(homography, (len(chosen), 1, 1)), known[source][chosen])
+        score = np.full(len(chosen), 0.7)
+        carried = Carried(chosen, np.full(len(chosen), -1), known[target][chosen] / UNIT, jacobian, score)
+        return Links(source, target, chosen, chosen, carried)
+
+    links = (link(0, 1, onward, B_FROM_A), link(1, 0, back, np.linalg.inv(B_FROM_A)))
+    seen = tuple(Photo(photo.name, photo.size_wh, UNIT, np.zeros((0, 2))) for photo in photos)
+    return LinkedKeypoints(seen, tuple(xy / UNIT for xy in known), links)
+
+
+def sharpen(linked, photos, matcher, folder, made_by=None, native_px: int = SIZE_WH[0]) -> LinkedKeypoints:
+    digests = {photo.name: digest_image(photo) for photo in photos}
+    return sharpen_links(linked, photos, matcher, native_px, folder / "native.h5", made_by or {}, digests, quiet=True)
+
+
+def measure_errors(linked: LinkedKeypoints) -> np.ndarray:
+    """How far predictions are off, px of the photos."""
+    errors = []
+    for links, homography in zip(linked.links, (B_FROM_A, np.linalg.inv(B_FROM_A))):
+        source, target = linked.photos[links.source_image], linked.photos[links.target_image]
+        truth = true_xy(homography, linked.xy[links.source_image][links.source] * source.px_per_unit)
+        errors.append(np.linalg.norm(links.carried.predicted * target.px_per_unit - truth, axis=1))
+    return np.concatenate(errors)
+
+
+@pytest.fixture(scope="module")
+def sharpened(photos, matcher, tmp_path_factory) -> LinkedKeypoints:
+    return sharpen(link_photos(photos, wrong=20), photos, matcher, tmp_path_factory.mktemp("out"))
+
+
+def test_predictions_get_sharper_in_both_directions(photos, sharpened):
+    before, after = measure_errors(link_photos(photos, wrong=20))[20:], measure_errors(sharpened)[20:]
+    half = len(before) // 2
+    for part in (slice(0, half), slice(half, None)):
+        assert np.median(after[part]) < 0.25 * np.median(before[part])
+        assert np.mean(after[part] < 0.5) > 0.9
+
+
+def test_jacobians_follow_the_plane(sharpened):
+    links = sharpened.links[0]
+    truth = differentiate(np.tile(B_FROM_A, (len(links.source), 1, 1)), sharpened.xy[0][links.source])
+    assert np.median(abs(links.carried.jacobian - truth)[20:]) < 0.02
+
+
+def test_units_are_those_of_the_photos(photos, sharpened):
+    assert [(photo.px_per_unit, photo.finer) for photo in sharpened.photos] == [(1.0, UNIT)] * 2
+    np.testing.assert_allclose(sharpened.xy[0], link_photos(photos, wrong=20).xy[0] * UNIT)
+
+
+def test_wrong_predictions_stay_and_count_less(photos, sharpened):
+    before, links = link_photos(photos, wrong=20).links[0].carried, sharpened.links[0].carried
+    np.testing.assert_allclose(links.predicted[:20], before.predicted[:20] * UNIT)
+    assert (links.score[:20] < 0.5 * before.score[:20]).all()
+    assert np.median(links.score[20:]) > 0.5
+
+
+def test_the_keypoints_of_tracks_end_where_they_should(photos, sharpened):
+    keypoints, matches = finish_keypoints(sharpened, KeypointConfig())
+    xy0, xy1 = (keypoints[side].xy[matches[0].indices[:, side]] for side in (0, 1))
+    errors = np.linalg.norm(true_xy(B_FROM_A, xy0) - xy1, axis=1)
+    assert len(errors) > 200 and np.median(errors) < 0.25
+    assert [found.name for found in keypoints] == [photo.name for photo in photos]
+
+
+def test_photos_of_the_matching_resolution_keep_their_units(photos, matcher, tmp_path):
+    linked = link_photos(photos)
+    small = tuple(dataclasses.replace(photo, px_per_unit=1.0) for photo in linked.photos)
+    xy = tuple(xy * UNIT for xy in linked.xy)
+    links = tuple(
+        dataclasses.replace(part, carried=dataclasses.replace(part.carried, predicted=part.carried.predicted * UNIT))
+        for part in linked.links
+    )
+    result = sharpen(LinkedKeypoints(small, xy, links), photos, matcher, tmp_path)
+    assert [photo.finer for photo in result.photos] == [1.0, 1.0]
+    before, after = measure_errors(linked), measure_errors(result)
+    near = before < 0.8
+    assert np.median(after[near]) < 0.5 * np.median(before[near])
+    for before, after in zip(links, result.links):
+        assert np.linalg.norm(before.carried.predicted - after.carried.predicted, axis=1).max() <= 1.0
+
+
+def test_what_was_done_is_not_done_again_and_other_links_are(photos, matcher, tmp_path, monkeypatch):
+    linked = link_photos(photos)
+    first = sharpen(linked, photos, matcher, tmp_path)
+    encoded = []
+    encode = sharpening.encode_native
+    monkeypatch.setattr(sharpening, "encode_native", lambda *args: encoded.append(args) or encode(*args))
+    again = sharpen(linked, photos, matcher, tmp_path)
+    assert not encoded
+    for a, b in zip(first.links, again.links):
+        np.testing.assert_array_equal(a.carried.predicted, b.carried.predicted)
+    sharpen(link_photos(photos, wrong=5), photos, matcher, tmp_path)
+    assert len(encoded) == 2
+    sharpen(link_photos(photos, wrong=5), photos, matcher, tmp_path, {"weights": "others"})
+    assert len(encoded) == 4
+
+
+def test_strips_make_the_features_of_the_whole(photos, matcher, monkeypatch):
+    image = prepare_image(photos[0], SIZE_WH[0])
+    strips = encode_native(matcher, image)
+    monkeypatch.setattr(sharpening, "STRIP_PX", 1024)
+    whole = encode_native(matcher, image)
+    assert strips.fine.size_wh == whole.fine.size_wh == (SIZE_WH[0] // 2, SIZE_WH[1] // 2)
+    off = (strips.fine.cells - whole.fine.cells).abs().float()
+    assert off.mean() < 0.01 * whole.fine.cells.abs().float().mean()
+
+
+@pytest.mark.parametrize("turn_deg", [0, 90, 180, 270])
+@pytest.mark.parametrize("scale", [0.3, 0.9, 1.2, 2.2])
+def test_photos_are_shown_upright_and_in_one_scale(turn_deg, scale):
+    angle = np.deg2rad(turn_deg + 12)
+    linear = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    variant0, variant1 = fit_variants(np.tile(linear, (5, 1, 1)))
+    assert (turn_deg + variant1.turn_deg) % 360 == 0 and variant0.turn_deg == 0
+    assert (variant0.reduction, variant1.reduction) == {0.3: (4, 1), 0.9: (1, 1), 1.2: (1, 1), 2.2: (1, 2)}[scale]
+
+
+def test_a_photo_on_its_side_and_twice_as_large_gets_sharper_too(photos, matcher, tmp_path):
+    large = cv2.resize(cv2.imread(str(photos[1].path)), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    cv2.imwrite(str(tmp_path / "b.png"), cv2.rotate(large, cv2.ROTATE_90_CLOCKWISE))
+    turned = [photos[0], read_ref(tmp_path / "b.png")]
+    width = 2 * SIZE_WH[1]
+    turned_from_b = np.array([[0, -2, width], [2, 0, 0], [0, 0, 1.0]])
+    linked = link_photos(turned)
+    links = linked.links[0]
+    xy_a = linked.xy[0][links.source] * UNIT
+    homography = turned_from_b @ B_FROM_A
+    truth = true_xy(homography, xy_a)
+    off = truth + np.random.default_rng(2).normal(0, 2 * NOISE_PX, truth.shape)
+    jacobian = differentiate(np.tile(homography, (len(xy_a), 1, 1)), xy_a)
+    carried = dataclasses.replace(links.carried, predicted=off / UNIT, jacobian=jacobian)
+    linked = dataclasses.replace(linked, links=(dataclasses.replace(links, carried=carried),))
+    after = sharpen(linked, turned, matcher, tmp_path, native_px=2 * SIZE_WH[0]).links[0].carried
+    errors = np.linalg.norm(after.predicted - truth, axis=1)
+    assert np.median(errors) < 0.3 * np.median(np.linalg.norm(off - truth, axis=1))
+    assert np.median(after.score) > 0.3
+
+
+def test_no_links_at_all(photos, matcher, tmp_path):
+    linked = dataclasses.replace(link_photos(photos), links=())
+    assert sharpen(linked, photos, matcher, tmp_path).links == ()
+
+
+def test_an_expectation_head_is_refused(photos, matcher, tmp_path):
+    net = HomoMatcher.from_pretrained("light_expectation").net
+    assert isinstance(net.head, ExpectationHead)
+    with pytest.raises(ConfigError, match="keypoints.native_px needs network.head homography"):
+        sharpen(link_photos(photos), photos, HomoMatcher(net, matcher.config, matcher.images), tmp_path)

@@ -1,0 +1,246 @@
+"""Pairs of photos that are turned against each other, or of very different scale."""
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from tqdm import tqdm
+
+from hm_sfm.coarse_matches import read_rgb
+from hm_sfm.config import ImageConfig, MatchingConfig
+from hm_sfm.coordinates import pixel_index_from_px, rotation_matrix
+from hm_sfm.images import CV_ROTATIONS, prepare_array, prepare_image, read_ref
+from hm_sfm.matching import FeatureCache
+from hm_sfm.network.model import HomoMatcher
+from hm_sfm.textures import MATERIALS, make_texture
+from hm_sfm.types import ImagePair, PatchMatches, apply_homographies
+from hm_sfm.variants import (
+    AS_THEY_ARE,
+    FEW_MATCHES,
+    SCALES,
+    TURNS,
+    UPRIGHT,
+    Sketch,
+    Variant,
+    choose_variants,
+    count_agreeing,
+    count_good,
+    place_cells,
+    relate_scales,
+    show_image,
+)
+
+SHIFT = np.array([[1, 0, -13], [0, 1, -9], [0, 0, 1.0]])
+"""Px of `photo` -> px of `other`."""
+CLOSER = np.array([[3, 0, -160], [0, 3, -160], [0, 0, 1.0]])
+"""Px of the whole scene at a third of its size -> px of `middle`."""
+
+
+@pytest.fixture(scope="module")
+def scene() -> np.ndarray:
+    """(480, 642) uint8: a collage, which is made faster than a scene is rendered."""
+    rng = np.random.default_rng(4)
+    tiles = [
+        [make_texture(rng, material, (1.07, 1.2), 100) for material in order]
+        for order in np.array(list(MATERIALS))[
+            [[5, 0, 6, 1, 4, 6], [6, 4, 1, 6, 5, 0], [1, 6, 5, 0, 6, 4], [4, 5, 6, 6, 1, 0]]
+        ]
+    ]
+    return cv2.cvtColor(np.vstack([np.hstack(row) for row in tiles]), cv2.COLOR_RGB2GRAY)
+
+
+@pytest.fixture(scope="module")
+def whole(scene) -> np.ndarray:
+    return cv2.resize(scene, (214, 160), interpolation=cv2.INTER_AREA)
+
+
+@pytest.fixture(scope="module")
+def middle(scene) -> np.ndarray:
+    return scene[160:400, 160:480]
+
+
+@pytest.fixture(scope="module")
+def photo(scene) -> np.ndarray:
+    return cv2.resize(scene, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)[40:232, 20:276]
+
+
+@pytest.fixture(scope="module")
+def other(scene) -> np.ndarray:
+    return cv2.resize(scene, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)[49:240, 33:289]
+
+
+@pytest.fixture(scope="module")
+def matcher() -> HomoMatcher:
+    return HomoMatcher.from_pretrained("light")
+
+
+@pytest.fixture(scope="module")
+def upright(matcher) -> HomoMatcher:
+    """The same one, that tries nothing else."""
+    return HomoMatcher(matcher.net, MatchingConfig(retry_turned=False), ImageConfig())
+
+
+def turn(image: np.ndarray, turn_deg: int) -> np.ndarray:
+    return cv2.rotate(image, CV_ROTATIONS[turn_deg])
+
+
+def measure_errors(matches: PatchMatches, truth: np.ndarray) -> np.ndarray:
+    """(M,) px of image 1."""
+    true = apply_homographies(np.broadcast_to(truth, (len(matches), 3, 3)), matches.xy0)
+    return np.linalg.norm(true - matches.xy1, axis=1)
+
+
+def assert_right(matches: PatchMatches, truth: np.ndarray, least: int) -> None:
+    """At least so many good matches, nearly all within 1 px, and their homographies the truth's."""
+    good = matches.select(matches.score >= 0.5)
+    assert len(good) >= least
+    assert (measure_errors(good, truth) < 1).mean() > 0.95
+    corner = good.xy0 + 0.7 * good.patch_radius_px
+    carried = apply_homographies(good.homography, corner)
+    expected = apply_homographies(np.broadcast_to(truth, (len(good), 3, 3)), corner)
+    assert np.median(np.linalg.norm(carried - expected, axis=1)) < 0.5
+
+
+@pytest.mark.parametrize("turn_deg", CV_ROTATIONS)
+def test_turned_photos_match_as_upright_ones_do(matcher, upright, photo, other, turn_deg):
+    truth = rotation_matrix((256, 191), turn_deg) @ SHIFT
+    turned = turn(other, turn_deg)
+    alone = upright.match(photo, turned)
+    assert np.count_nonzero(measure_errors(alone, truth) < 1) < 10
+    assert_right(matcher.match(photo, turned), truth, 350)
+
+
+def test_a_photo_three_times_closer(matcher, upright, whole, middle):
+    assert np.count_nonzero(measure_errors(upright.match(whole, middle), CLOSER) < 3) < 20
+    matches = matcher.match(whole, middle)
+    good = matches.select(matches.score >= 0.5)
+    assert len(good) > 50
+    assert np.median(measure_errors(good, CLOSER)) < 1.5  # a pixel of the whole is three of the middle
+
+
+def test_a_turned_photo_and_its_thumbnail(matcher, upright, scene):
+    large = scene[150:406, 150:490]
+    small = turn(cv2.resize(large, (136, 102), interpolation=cv2.INTER_AREA), 90)
+    truth = rotation_matrix((136, 102), 90) @ np.diag([136 / 340, 102 / 256, 1])
+    assert np.count_nonzero(measure_errors(upright.match(large, small), truth) < 1) < 10
+    assert_right(matcher.match(large, small), truth, 80)
+
+
+def test_pairs_that_match_as_they_are_stay_the_same(matcher, upright, photo, scene, one_thread):
+    beside = cv2.resize(scene, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)[60:220, 90:300]
+    found, expected = (each.match(photo, beside) for each in (matcher, upright))
+    assert 100 < count_good(expected) < FEW_MATCHES  # so that it is looked at
+    for field in ("xy0", "xy1", "score", "homography"):
+        assert getattr(found, field).tobytes() == getattr(expected, field).tobytes()
+
+
+def test_nothing_to_see(matcher, photo):
+    flat, tiny = np.full((100, 120), 90, np.uint8), np.ascontiguousarray(photo[:32, :32])
+    for pair in ((flat, photo), (flat, flat), (tiny, flat)):
+        matches = matcher.match(*pair)
+        assert np.isfinite(matches.homography).all() and count_good(matches) < 100
+        sketches = [Sketch(matcher, prepare_array(image, 1024)) for image in pair]
+        assert choose_variants(matcher, *sketches) is None
+
+
+@pytest.fixture
+def folder(tmp_path, photo, other) -> Path:
+    """Photos that are turned against each other, and one of something else."""
+    noise = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (96, 128), np.uint8), (0, 0), 3)
+    for name, image in (("a", photo[:128, 80:240]), ("b", turn(other[:128, 60:220], 90)), ("c", noise)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), image)
+    return tmp_path
+
+
+def test_neither_order_nor_memory_matter(matcher, folder, one_thread):
+    images = [read_ref(path) for path in sorted(folder.glob("*.png"))]
+    pairs = [ImagePair(f"{a}.png", f"{b}.png") for a, b in ("ab", "bc", "ac")]
+    found = []
+    for order, limit_mb in ((pairs, 1500), (pairs[::-1], 3)):
+        cache = FeatureCache(images, matcher, limit_mb, tqdm(disable=True))
+        found.append({pair: cache.match(pair) for pair in order})
+        held = sum(made.size_bytes for made in cache.cached.values())
+        assert held <= limit_mb * 1_000_000
+    for pair in pairs:
+        one, two = found[0][pair], found[1][pair]
+        assert (
+            one.pair == pair and one.xy1.tobytes() == two.xy1.tobytes() and one.score.tobytes() == two.score.tobytes()
+        )
+        assert (count_good(one) > 100) == (pair == pairs[0])
+    # The same as of the photos without a cache.
+    direct = matcher.match(folder / "a.png", folder / "b.png")
+    assert direct.xy1.tobytes() == found[0][pairs[0]].xy1.tobytes()
+
+
+def test_given_matches_of_turned_photos_become_homographies(matcher, folder, tmp_path):
+    """px of a.png -> px of b.png: crops of `photo` and `other`, the latter turned."""
+    between = np.array([[1, 0, 7], [0, 1, -9], [0, 0, 1.0]])
+    truth = rotation_matrix((160, 128), 90) @ between
+    xy0 = np.stack(np.meshgrid(np.arange(20.0, 140, 7), np.arange(20.0, 120, 7)), axis=-1).reshape(-1, 2)
+    xy1 = apply_homographies(np.broadcast_to(truth, (len(xy0), 3, 3)), xy0)
+    with h5py.File(tmp_path / "points.h5", "w") as h5:
+        h5["a.png/b.png/keypoints0"], h5["a.png/b.png/keypoints1"] = map(pixel_index_from_px, (xy0, xy1))
+    config = MatchingConfig(coarse_matches=str(tmp_path / "points.h5"))
+    given = HomoMatcher(matcher.net, config, ImageConfig())
+    assert_right(given.match(folder / "a.png", folder / "b.png"), truth, len(xy0) // 2)
+    config = dataclasses.replace(config, retry_turned=False)
+    alone = HomoMatcher(matcher.net, config, ImageConfig()).match(folder / "a.png", folder / "b.png")
+    assert count_good(alone) < len(xy0) // 4
+
+
+@pytest.mark.parametrize("turn_deg", [0, *CV_ROTATIONS])
+@pytest.mark.parametrize("reduction", [1, 2])
+def test_points_of_a_variant_are_those_of_the_stored_photo(turn_deg, reduction):
+    blocks = np.random.default_rng(0).integers(0, 255, (24, 40), np.uint8)
+    image = prepare_array(np.kron(blocks, np.ones((2, 2), np.uint8)), 1024)
+    shown = show_image(image, Variant(turn_deg, reduction))
+    row, column = np.indices(shown.grey.shape).reshape(2, -1)
+    stored = np.column_stack([column + 0.5, row + 0.5, np.ones(len(row))]) @ shown.stored_from_scaled.T
+    x, y = (stored[:, :2] / 2).astype(int).T
+    np.testing.assert_allclose(shown.grey[row, column] * 255, blocks[y, x], atol=1e-3)
+    assert shown.ref.rotation_deg == turn_deg
+    again = show_image(shown, Variant(-turn_deg % 360))
+    assert again.ref.rotation_deg == 0
+    np.testing.assert_allclose(again.stored_from_scaled, np.diag([reduction, reduction, 1]))
+
+
+def test_the_photo_as_it_is_is_not_touched(photo):
+    image = prepare_array(photo, 1024)
+    assert show_image(image, UPRIGHT) is image
+
+
+def test_providers_that_read_the_photo_read_it_turned(tmp_path):
+    colours = np.random.default_rng(0).integers(0, 255, (48, 80, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "a.png"), colours)
+    image = prepare_image(read_ref(tmp_path / "a.png"), 1024)
+    np.testing.assert_array_equal(read_rgb(show_image(image, Variant(270))), turn(read_rgb(image), 270))
+
+
+def test_each_way_is_compared_once():
+    ways = TURNS + SCALES
+    assert ways[0] == AS_THEY_ARE and len(ways) == len(set(ways)) == 4 + 4 * 4
+    assert all(variant0.turn_deg == 0 and 1 in (variant0.reduction, variant1.reduction) for variant0, variant1 in ways)
+
+
+def test_scales_of_sketches_are_scales_of_photos():
+    reduced = Variant(90, 2)
+    assert relate_scales((UPRIGHT, reduced), 2.5, 2.5) == (UPRIGHT, reduced)
+    assert relate_scales((UPRIGHT, UPRIGHT), 2.5, 1.0) == (Variant(0, 2.5), UPRIGHT)
+    assert relate_scales((UPRIGHT, Variant(180, 3)), 2.0, 1.0) == (UPRIGHT, Variant(180, 1.5))
+    assert relate_scales((UPRIGHT, reduced), 2.0, 1.2) == (UPRIGHT, Variant(90))
+
+
+def test_matches_agree_with_those_around_them():
+    count = np.arange(60)
+    cells = place_cells(count, 10)
+    assert cells[13].tolist() == [3, 1]
+    assert count_agreeing(cells, cells + 5) == 60
+    assert count_agreeing(cells, cells[::-1]) == 0  # turned by 180 degrees
+    assert count_agreeing(cells, cells[:, ::-1] * (-1, 1)) == 0  # and by 90
+    assert count_agreeing(cells, np.random.default_rng(0).permutation(cells)) == 0
+    wrong = np.where((count % 7 == 3)[:, None], cells[::-1], cells)
+    assert 40 < count_agreeing(cells, wrong) <= 52
+    assert count_agreeing(cells[:0], cells[:0]) == count_agreeing(cells[:8], cells[:8]) == 0

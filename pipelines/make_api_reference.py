@@ -15,7 +15,7 @@ TARGET = ROOT / "docs" / "api.md"
 MODULES = (
     "types", "coordinates", "config", "errors", "images", "masks", "frames", "pairs", "network.model", "matching",
     "verification", "keypoints", "tracks", "database", "mapping", "reconstruction", "diagnosis", "evaluation", "hloc",
-    "conversion", "coarse_matches", "refinement",
+    "conversion", "coarse_matches", "refinement", "variants", "sharpening", "rigs", "bitmaps", "snapshots",
 )  # fmt: skip
 """In the order in which they are worth reading: the types first, then the stages, then what goes with them."""
 HEADER = """# Python API

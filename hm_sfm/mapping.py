@@ -31,6 +31,10 @@ logger = logging.getLogger(__name__)
 # keypoints, at the same result; local bundle adjustment follows every image anyway.
 GLOBAL_ADJUSTMENT_RATIO = 1.3
 
+# Observations farther from their point than this are dropped: what verification allows by default. COLMAP's own 4 px are
+# meant for keypoints that are less exact.
+FILTER_ERROR_PX = 3.0
+
 # Error of matches that calibration allows, of the longer side of the photos: what verification allows by default.
 CALIBRATION_ERROR = 0.003
 
@@ -282,6 +286,7 @@ def _pipeline_options(config: MappingConfig, fix_intrinsics: bool) -> pycolmap.I
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = config.seed
     options.min_model_size = config.min_model_size
+    options.mapper.filter_max_reproj_error = FILTER_ERROR_PX
     options.ba_global_frames_ratio = GLOBAL_ADJUSTMENT_RATIO
     options.ba_global_points_ratio = GLOBAL_ADJUSTMENT_RATIO
     options.ba_global_function_tolerance = GLOBAL_TOLERANCE

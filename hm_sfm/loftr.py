@@ -1,5 +1,6 @@
 """LoFTR itself, through kornia, with a checkpoint that the user has: a matcher to compare with."""
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,7 +48,8 @@ class LoftrMatcher:
             raise MissingPackageError(
                 "LoFTR's own matches need the package kornia, which is not installed: pip install kornia"
             ) from error
-        self.config, self.images = config, images
+        # LoFTR is compared as it is: photos are not matched again in other ways.
+        self.config, self.images = dataclasses.replace(config, retry_turned=False), images
         self.made_by = {
             "weights": digest_weights(str(checkpoint)),
             "kornia": kornia.__version__,

@@ -173,7 +173,8 @@ def place_again(
     missing = [pair for pair in placed if pair not in store]
     image_of = {image.name: image for image in images}
     largest = max((math.prod(size_at(image, native_px)) for image in images), default=1)
-    bytes_per_px = 2 * matcher.net.backbone.fine_channels / matcher.net.backbone.fine_grid.stride**2
+    # Of 4-byte features; where the processor computes in half precision they take half of that.
+    bytes_per_px = 4 * matcher.net.backbone.fine_channels / matcher.net.backbone.fine_grid.stride**2
     capacity = max(2, int(matcher.config.feature_cache_mb * 1e6 / (largest * bytes_per_px)))
 
     @lru_cache(maxsize=capacity)

@@ -9,13 +9,14 @@ precision is used where the processor has it.
 import os
 import time
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 from tqdm import tqdm
 
-from hm_sfm import matching
+from hm_sfm.batches import store_in_batches
 from hm_sfm.errors import HmSfmError, WorkerLostError
 from hm_sfm.matching import FeatureCache, MatchingTimes
 from hm_sfm.network.model import HomoMatcher
@@ -83,6 +84,16 @@ def match_on_cluster(
     return MatchingTimes(features=features, match=time.monotonic() - started - features)
 
 
+@contextmanager
+def killing(ray: Any, workers: Sequence[Any]) -> Iterator[None]:
+    """Kill the workers in the end, however it comes: those that the list holds then."""
+    try:
+        yield
+    finally:
+        for worker in workers:
+            ray.kill(worker)
+
+
 def spread_pairs(
     ray: Any,
     images: Sequence[ImageRef],
@@ -112,9 +123,8 @@ def spread_pairs(
     losses: Counter[Any] = Counter()
     lost = (ray.exceptions.RayActorError, ray.exceptions.ObjectLostError, ray.exceptions.OutOfMemoryError)
 
-    batch: list[PairMatches] = []
-    stored_at, left, encoding = time.monotonic(), len(chunks), 0.0
-    try:
+    left, encoding = len(chunks), 0.0
+    with store_in_batches(store.write) as keep, killing(ray, workers):
         while left:
             (done,), _ = ray.wait(list(running), num_returns=1)
             k, chunk = running.pop(done)
@@ -141,7 +151,7 @@ def spread_pairs(
                 idle.add(k)
                 if chunk:
                     matches, seconds = result
-                    batch += matches
+                    keep(matches)
                     encoding += seconds
                     left -= 1
                     progress.update(len(chunk))
@@ -151,11 +161,4 @@ def spread_pairs(
                     chunk = queue.popleft() if queue is queues[k] else queue.pop()
                     running[workers[k].match.remote(chunk)] = (k, chunk)
                     idle.discard(k)
-            if time.monotonic() - stored_at > matching.BATCH_SECONDS:
-                store.write(batch)
-                batch, stored_at = [], time.monotonic()
-    finally:
-        for worker in workers:
-            ray.kill(worker)
-        store.write(batch)
     return encoding / count

@@ -9,6 +9,7 @@ from importlib.util import find_spec
 
 from tqdm import tqdm
 
+from hm_sfm.batches import store_in_batches
 from hm_sfm.errors import ConfigError, MissingPackageError
 from hm_sfm.images import PreparedImage, prepare_image
 from hm_sfm.network.model import HomoMatcher, ImageFeatures
@@ -16,9 +17,6 @@ from hm_sfm.schedule import order_pairs
 from hm_sfm.store import MatchStore
 from hm_sfm.types import ImagePair, ImageRef, PairMatches, PatchMatches
 from hm_sfm.variants import UPRIGHT, Sketch, Variant, match_again, show_image
-
-BATCH_SECONDS = 20.0
-"""Matches are stored at least this often: what a crash can lose."""
 
 
 @dataclass(frozen=True)
@@ -115,27 +113,21 @@ def match_pairs(
 
         return match_on_cluster(images, pairs, matcher, store, quiet)
     missing = [pair for pair in pairs if pair not in store]
-    started = stored_at = time.monotonic()
+    started = time.monotonic()
     names = {name for pair in missing for name in (pair.name0, pair.name1)}
-    batch: list[PairMatches] = []
     with (
         tqdm(total=len(names), desc="features", unit="image", disable=quiet or not names) as images_bar,
         tqdm(
             total=len(pairs), initial=len(pairs) - len(missing), desc="matches", unit="pair", disable=quiet
         ) as pairs_bar,
+        store_in_batches(store.write) as keep,
     ):
         cache = FeatureCache(images, matcher, matcher.config.feature_cache_mb, images_bar)
         if missing:
             capacity = cache.limit_bytes // cache.get(missing[0].name0).size_bytes
             missing = order_pairs(missing, max(2, capacity))
-        try:
-            for pair in missing:
-                batch.append(cache.match(pair))
-                pairs_bar.update()
-                if time.monotonic() - stored_at > BATCH_SECONDS:
-                    store.write(batch)
-                    batch, stored_at = [], time.monotonic()
-        finally:
-            store.write(batch)
+        for pair in missing:
+            keep([cache.match(pair)])
+            pairs_bar.update()
     store.merge()
     return MatchingTimes(features=cache.seconds, match=time.monotonic() - started - cache.seconds)

@@ -7,7 +7,6 @@ and go.
 """
 
 import logging
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from hm_sfm.atomic import replace_file
+from hm_sfm.batches import store_in_batches
 from hm_sfm.config import fingerprint
 from hm_sfm.images import prepare_image
 from hm_sfm.network.model import HomoMatcher
@@ -36,8 +36,6 @@ VOCABULARY_CELLS = 20_000
 """Cells of all photos together that the vocabulary is learned from."""
 CELLS_PER_WORD = 20
 """Fewer cells make fewer words."""
-BATCH_SECONDS = 20.0
-"""Samples are stored at least this often: what a crash can lose."""
 BLOCK_ROWS = 512
 """Rows of the similarity matrix that are held at a time."""
 
@@ -131,21 +129,14 @@ def encode_images(
         for image in images
         if any(name_sample(digests[image.name], turn_deg) not in store for turn_deg in turns_deg)
     }
-    batch: dict[str, np.ndarray] = {}
-    stored_at = time.monotonic()
-    try:
+    with store_in_batches(lambda batch: store.write(dict(batch))) as keep:
         for digest, image in tqdm(missing.items(), desc="retrieval", unit="image", disable=quiet or not missing):
             prepared = prepare_image(image, LONG_EDGE_PX)
             for turn_deg in turns_deg:
                 key = name_sample(digest, turn_deg)
                 if key not in store:
                     cells = matcher.encode_plain(show_image(prepared, Variant(turn_deg))).cpu().numpy()
-                    batch[key] = sample_cells(cells)
-            if time.monotonic() - stored_at > BATCH_SECONDS:
-                store.write(batch)
-                batch, stored_at = {}, time.monotonic()
-    finally:
-        store.write(batch)
+                    keep([(key, sample_cells(cells))])
 
 
 def name_sample(digest: str, turn_deg: int) -> str:

@@ -9,7 +9,6 @@ import dataclasses
 import hashlib
 import math
 import shutil
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,10 +19,10 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from hm_sfm.batches import store_in_batches
 from hm_sfm.errors import ConfigError, StaleResultError
 from hm_sfm.images import PreparedImage, prepare_image
 from hm_sfm.keypoints import LinkedKeypoints, Links, Photo, differentiate
-from hm_sfm.matching import BATCH_SECONDS
 from hm_sfm.network.fine import FineMap, HomographyHead, make_fine_map
 from hm_sfm.network.homography import is_regular
 from hm_sfm.network.model import (
@@ -181,18 +180,11 @@ def place_again(
     def encode(name: str, variant: Variant) -> NativeFeatures:
         return encode_native(matcher, prepare_image(image_of[name], native_px), variant)
 
-    batch: list[PairMatches] = []
-    stored_at = time.monotonic()
-    try:
+    with store_in_batches(store.write) as keep:
         for pair in tqdm(order_pairs(missing, capacity), desc="native", unit="pair", disable=quiet or not missing):
             names, placement = (pair.name0, pair.name1), placed[pair]
             variants = fit_variants(relate_inputs(*(encode(name, UPRIGHT) for name in names), placement))
-            batch.append(place_pair(matcher, *map(encode, names, variants), pair, placement))
-            if time.monotonic() - stored_at > BATCH_SECONDS:
-                store.write(batch)
-                batch, stored_at = [], time.monotonic()
-    finally:
-        store.write(batch)
+            keep([place_pair(matcher, *map(encode, names, variants), pair, placement)])
     store.merge()
 
 

@@ -21,8 +21,8 @@ from hm_sfm.pairs import read_pairs
 STORING_EACH_PAIR = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
-import hm_sfm.matching
-hm_sfm.matching.BATCH_SECONDS = 0.0
+import hm_sfm.batches
+hm_sfm.batches.BATCH_SECONDS = 0.0
 from hm_sfm.cli import main
 sys.exit(main(sys.argv[1:]))
 """

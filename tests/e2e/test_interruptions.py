@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import hm_sfm.matching
+import hm_sfm.batches
 from hm_sfm.cli import main
 
 KILLS = int(os.environ.get("KILLS", "5"))
@@ -22,7 +22,7 @@ KILLS = int(os.environ.get("KILLS", "5"))
 def match_here(photos: Path, out: Path, errors: Path, file_limit: int | None) -> None:
     """hm-sfm match in a process forked for it; each pair is stored at once, no file grows beyond file_limit bytes."""
     os.dup2(os.open(errors, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
-    hm_sfm.matching.BATCH_SECONDS = 0.0
+    hm_sfm.batches.BATCH_SECONDS = 0.0
     if file_limit:
         resource.setrlimit(resource.RLIMIT_FSIZE, (file_limit, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     sys.exit(main(["match", str(photos), str(out), "--quiet"]))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-import hm_sfm.retrieval as retrieval
+from hm_sfm import batches, retrieval
 from hm_sfm.config import Config, ImageConfig, MatchingConfig, NetworkConfig, PairConfig
 from hm_sfm.errors import InputError
 from hm_sfm.images import CV_ROTATIONS, prepare_array, read_ref
@@ -129,7 +129,7 @@ def test_an_interrupted_pass_goes_on(ring, tmp_path, monkeypatch):
 
 
 def test_a_killed_pass_keeps_its_batches(ring, tmp_path, monkeypatch):
-    monkeypatch.setattr(retrieval, "BATCH_SECONDS", 0.0)
+    monkeypatch.setattr(batches, "BATCH_SECONDS", 0.0)
     write = CellStore.write
 
     def die_at_the_third(store, batch):

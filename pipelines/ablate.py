@@ -2,12 +2,12 @@
 
     python pipelines/ablate.py configs/train_ablations.yaml --scene SCENE --attention-weights FILE
 
-Every variant of the fine stage starts from the same weights and is trained for the same few steps. FILE holds a trained
+Every variant of the fine stage starts from the same features, with a new head, and is trained for the same few steps. FILE holds a trained
 coarse transformer: its network is judged with it, and without it by mutual nearest neighbours of the plain features;
 without FILE there is no third table. SCENE has the layout of Strecha's data sets: images/, gt_dense_cameras/ and K.txt.
 
 Variants lie in folders of their own below the configuration's `out`: an interrupted run goes on from there, and what is
-done is not done again. After a change of code, photos or scene, take a new `out`.
+done is not done again. After a change of code, photos, scene or weights, take a new `out`.
 """
 
 import argparse
@@ -16,13 +16,23 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from ablation_scores import Scores, Trial, describe_trial, drop_transformer, prepare_trial, score_once
+import torch
+from ablation_scores import (
+    Scores,
+    Trial,
+    describe_trial,
+    drop_transformer,
+    prepare_trial,
+    score_cells,
+    score_matches,
+    score_once,
+)
 from tables import format_markdown
 
 from hm_sfm.atomic import replace_file
 from hm_sfm.config import load_config
 from hm_sfm.errors import ConfigError, HmSfmError
-from hm_sfm.network.model import digest_weights, load_weights
+from hm_sfm.network.model import digest_weights, load_weights, read_checkpoint
 from hm_sfm.training.loop import TrainConfig, train
 
 SUPERVISIONS = {"semi-dense": "centre", "+ dense": "dense", "+ suppressed": "suppressed"}
@@ -37,6 +47,7 @@ def ablate(config: TrainConfig, scene: Path, attention_weights: Path | None) -> 
     """The tables, as Markdown. Raises HmSfmError on unusable photos, scene or weights."""
     trial = prepare_trial(config, scene)
     coarse = score_coarse(attention_weights, trial) if attention_weights else {}
+    config = replace(config, start_from=str(drop_head(Path(config.start_from), Path(config.out) / "features.pt")))
     losses = {row: score_variant(replace(config, supervise=name), trial) for row, name in SUPERVISIONS.items()}
     # LoFTR's head, trained as LoFTR does: a point has no homography to supervise.
     expectation = replace(config, network=replace(config.network, head="expectation"), supervise="centre")
@@ -52,6 +63,18 @@ def ablate(config: TrainConfig, scene: Path, attention_weights: Path | None) -> 
     return "".join(f"\n## {title}\n\n{table}\n" for title, table in tables.items() if table)
 
 
+def drop_head(weights: Path, path: Path) -> Path:
+    """Where the weights without their head lie: at `path` now, or as they are where they are a backbone's alone."""
+    content = read_checkpoint(weights)
+    if "state_dict" not in content:
+        return weights
+    state = {key: value for key, value in content["state_dict"].items() if not key.startswith("head.")}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(path) as temporary:
+        torch.save({**content, "state_dict": state}, temporary)
+    return path
+
+
 def score_variant(config: TrainConfig, trial: Trial) -> Scores:
     """Train a variant of the fine stage, or what is left of it, and score it."""
     net = config.network
@@ -59,7 +82,7 @@ def score_variant(config: TrainConfig, trial: Trial) -> Scores:
     config = replace(config, out=str(Path(config.out) / name))
     print(name, file=sys.stderr)
     stored = Path(config.out) / f"scores-{trial.key}.json"
-    return score_once(stored, trial, lambda: load_weights(str(train(config, resume=True))))
+    return score_once(stored, lambda: score_matches(load_weights(str(train(config, resume=True))), trial))
 
 
 def score_coarse(weights: Path, trial: Trial) -> dict[str, Scores]:
@@ -68,10 +91,12 @@ def score_coarse(weights: Path, trial: Trial) -> dict[str, Scores]:
     if net.config.coarse != "attention":
         raise ConfigError(f"{weights} has no coarse transformer: network.coarse is {net.config.coarse!r}")
     folder = Path(trial.config.out) / f"coarse-{digest_weights(str(weights))[:8]}"
-    return {
-        "with": score_once(folder / f"with-{trial.key}.json", trial, lambda: net),
-        "without": score_once(folder / f"without-{trial.key}.json", trial, lambda: drop_transformer(net)),
-    }
+    nets = {"with": net, "without": drop_transformer(net)}
+
+    def score(row: str) -> Scores:
+        return score_cells(nets[row], trial) | score_matches(nets[row], trial)
+
+    return {row: score_once(folder / f"{row}-{trial.key}.json", lambda row=row: score(row)) for row in nets}
 
 
 def main() -> None:

@@ -79,27 +79,34 @@ def prepare_trial(config: TrainConfig, scene: Path) -> Trial:
     return Trial(config, scene, photos, real_scenes, read_strecha_pairs(scene))
 
 
-def score_once(path: Path, trial: Trial, make_net: Callable[[], HomoNet]) -> Scores:
-    """The scores that an earlier run stored in `path`; otherwise those of the network, which are stored there."""
+def score_once(path: Path, score: Callable[[], Scores]) -> Scores:
+    """The scores that an earlier run stored in `path`; otherwise those of now, which are stored there."""
     if not path.exists():
-        scores = score_net(make_net(), trial)
+        scores = score()
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, scores)
     return json.loads(path.read_text())
 
 
-def score_net(net: HomoNet, trial: Trial) -> Scores:
-    """All figures of a network: `recall` and `precision` of its coarse stage, `real` ones on real photos, `PCK` of the
-    points that its patches cover, `centre` of the patches' centres alone, `AUC@5` of poses, all in percent, and `ms`.
-    """
-    config = trial.config
-    # A similarity, not a confidence, is what plain features are matched by.
+def make_matcher(net: HomoNet, config: TrainConfig) -> HomoMatcher:
+    """The network with the threshold that its coarse stage is trained for: a similarity for plain features."""
     threshold = MatchingConfig().coarse_threshold if net.config.coarse == "cosine" else config.coarse_threshold
-    matching = MatchingConfig(coarse_threshold=threshold, device=config.device)
-    matcher = HomoMatcher(net, matching, ImageConfig())
-    batches = [collate_pairs([pair]) for pair in (*trial.known, *trial.real)]
-    coarse = score_network(net, batches, "coarse", 0, threshold, config.precision, matcher.device, torch.Generator())
-    scores = {name.replace("rendered_", "").replace("_", " "): value for name, value in coarse.items()}
+    return HomoMatcher(net, MatchingConfig(coarse_threshold=threshold, device=config.device), ImageConfig())
+
+
+def score_cells(net: HomoNet, trial: Trial) -> Scores:
+    """`recall` and `precision` of a network's coarse stage, and `real` ones on real photos, in percent."""
+    matcher, batches = make_matcher(net, trial.config), [collate_pairs([pair]) for pair in (*trial.known, *trial.real)]
+    threshold, precision = matcher.config.coarse_threshold, trial.config.precision
+    scores = score_network(net, batches, "coarse", 0, threshold, precision, matcher.device, torch.Generator())
+    return {name.replace("rendered_", "").replace("_", " "): value for name, value in scores.items()}
+
+
+def score_matches(net: HomoNet, trial: Trial) -> Scores:
+    """Figures of a network's matches: `PCK` of the points that its patches cover, `centre` of the patches' centres
+    alone, `AUC@5` of poses, all in percent, and `ms` of its stages.
+    """
+    matcher, scores = make_matcher(net, trial.config), {}
     errors = [measure_matches(matcher, pair) for pair in trial.known]
     for name, parts in zip(("PCK", "centre"), zip(*errors)):
         pooled = np.concatenate(parts)
@@ -181,8 +188,8 @@ Made by
 
     {command}
 
-Each variant of the fine stage: {config.steps} steps of {config.pairs_per_step} pairs of {config.size_px} px, from the
-weights `{Path(config.start_from).name}`. The first table is of w/r/K = {net.window}/{net.radius}/{net.iterations}; in
+Each variant of the fine stage: {config.steps} steps of {config.pairs_per_step} pairs of {config.size_px} px, with the
+features of `{Path(config.start_from).name}`, which go on learning, and a head that starts new. The first table is of w/r/K = {net.window}/{net.radius}/{net.iterations}; in
 the second, homographies are supervised as in the last row of the first, and `expectation` is LoFTR's head, which has a
 centre only to supervise.
 

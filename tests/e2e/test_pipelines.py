@@ -184,6 +184,10 @@ def test_ablate(ablate, tmp_path, monkeypatch, matched_pairs):
         f"homography-9-1-3-{supervise}" for supervise in ("centre", "dense", "suppressed")
     ]
 
+    # The variants have the features in common that they start from; all heads start new.
+    features = model.read_checkpoint(tmp_path / "variants" / "features.pt")["state_dict"]
+    assert features.keys() == {key for key in light.state_dict() if not key.startswith("head.")}
+
     # All is done: nothing is trained or matched, and without the weights there are two tables.
     matched_pairs.clear()
     monkeypatch.setattr(loop, "run_training", None)

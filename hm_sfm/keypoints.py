@@ -10,7 +10,7 @@ made the keypoints sharper, see hm_sfm.sharpening; results are px of the stored 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -85,6 +85,10 @@ class Carried:
     score: np.ndarray
     """(C,)."""
 
+    def select(self, chosen: np.ndarray) -> "Carried":
+        """Those that `chosen`, (C,) bool, names."""
+        return Carried(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
 
 @dataclass(frozen=True)
 class Links:
@@ -97,6 +101,11 @@ class Links:
     """(E,) int64, indices into the two images' keypoints."""
     carried: Carried
 
+    def select(self, chosen: np.ndarray) -> "Links":
+        """Those that `chosen`, (E,) bool, names."""
+        ends = {"source": self.source[chosen], "target": self.target[chosen]}
+        return replace(self, **ends, carried=self.carried.select(chosen))
+
 
 @dataclass(frozen=True)
 class LinkedKeypoints:
@@ -106,6 +115,29 @@ class LinkedKeypoints:
     xy: tuple[np.ndarray, ...]
     """By photo, (K, 2) units."""
     links: tuple[Links, ...]
+
+
+@dataclass(frozen=True)
+class SettledTracks:
+    """All keypoints, those of one image after those of the other, and all links between them, one after another."""
+
+    image: np.ndarray
+    """(K,) int64: index of the photo."""
+    label: np.ndarray
+    """(K,) int64: the track."""
+    xy: np.ndarray
+    """(K, 2) units, adjusted."""
+    sigma: np.ndarray
+    """(K,) units."""
+    kept: np.ndarray
+    """(K,) bool: in a track of two images or more, and within the budget."""
+    source: np.ndarray
+    target: np.ndarray
+    """(E,) int64, indices into all keypoints."""
+    score: np.ndarray
+    """(E,)."""
+    used: np.ndarray
+    """(E,) bool: links between kept keypoints that agree with them."""
 
 
 class GrowingKeypoints:
@@ -313,6 +345,36 @@ def finish_keypoints(
 
     Returns the Keypoints of every image, and the IndexMatches of every pair that shares tracks.
     """
+    photos, tracks = linked.photos, settle_tracks(linked, config)
+    image, kept = tracks.image, tracks.kept
+    length = measure_lengths(tracks.label)
+    keypoints = []
+    for i, photo in enumerate(photos):
+        mine = kept & (image == i)
+        quality = (length[mine] / len(photos)).clip(0, 1)
+        xy, sigma = tracks.xy[mine] * photo.px_per_unit, tracks.sigma[mine] * photo.px_per_unit
+        keypoints.append(Keypoints(photo.name, xy, sigma, quality))
+    kept_start = np.concatenate([[0], np.cumsum(np.bincount(image[kept], minlength=len(photos)))])
+    index = np.cumsum(kept) - 1 - kept_start[image]
+    used = tracks.used
+    matches = group_matches(photos, image, index, tracks.source[used], tracks.target[used], tracks.score[used])
+    return tuple(keypoints), matches
+
+
+def thin_links(linked: LinkedKeypoints, config: KeypointConfig) -> LinkedKeypoints:
+    """The links alone that finish_keypoints would make matches of; all keypoints stay, with or without links."""
+    used = settle_tracks(linked, config).used
+    ends = np.cumsum([len(links.source) for links in linked.links])
+    links = [
+        links.select(of_links)
+        for links, of_links in zip(linked.links, np.split(used, ends[:-1]) if linked.links else ())
+        if of_links.any()
+    ]
+    return replace(linked, links=tuple(links))
+
+
+def settle_tracks(linked: LinkedKeypoints, config: KeypointConfig) -> SettledTracks:
+    """Form tracks, adjust them jointly, give up the links that disagree then, and choose the keypoints to keep."""
     photos, links = linked.photos, linked.links
     counts = [len(xy) for xy in linked.xy]
     start = np.concatenate([[0], np.cumsum(counts)])
@@ -346,19 +408,8 @@ def finish_keypoints(
     kept = inside & (length >= 2)
     spread = moved[kept] / finer[kept, None]
     kept[kept] = choose_budget(label[kept], length[kept], sigma[kept], spread, image[kept], config.max_keypoints)
-    new_index = np.cumsum(kept) - 1
-    kept_start = np.concatenate([[0], np.cumsum(np.bincount(image[kept], minlength=len(photos)))])
-
-    keypoints = []
-    for i, photo in enumerate(photos):
-        mine = kept & (image == i)
-        quality = (length[mine] / len(photos)).clip(0, 1)
-        keypoints.append(
-            Keypoints(photo.name, moved[mine] * photo.px_per_unit, sigma[mine] * photo.px_per_unit, quality)
-        )
     used = agreed & (label[source] == label[target]) & kept[source] & kept[target]
-    matches = group_matches(photos, image, new_index - kept_start[image], source[used], target[used], score[used])
-    return tuple(keypoints), matches
+    return SettledTracks(image, label, moved, sigma, kept, source, target, score, used)
 
 
 def group_matches(

@@ -25,7 +25,7 @@ from hm_sfm.diagnosis import Diagnosis, diagnose
 from hm_sfm.errors import InputError, NoModelError
 from hm_sfm.hloc import write_features, write_matches
 from hm_sfm.images import list_images, prepare_image
-from hm_sfm.keypoints import LinkedKeypoints, Photo, find_seeds, finish_keypoints, link_keypoints
+from hm_sfm.keypoints import LinkedKeypoints, Photo, find_seeds, finish_keypoints, link_keypoints, thin_links
 from hm_sfm.locks import lock_file, release_locks, wait_in_line
 from hm_sfm.mapping import choose_mapper, map_images, summarise_models
 from hm_sfm.masks import NO_MASKS, MaskedStore, Masks, read_masks
@@ -329,6 +329,7 @@ def carry_keypoints(
         quiet,
     )
     if config.keypoints.native_px > config.images.long_edge_px:
+        linked = thin_links(linked, config.keypoints)  # the second pass is worth its time for what is kept only
         linked = sharpen(linked, images, store.store if isinstance(store, MaskedStore) else store, config, quiet)
     return finish_keypoints(linked, config.keypoints)
 

@@ -12,8 +12,11 @@ from hm_sfm.keypoints import (
     Photo,
     differentiate,
     find_seeds,
+    finish_keypoints,
     group_matches,
+    link_keypoints,
     persist_keypoints,
+    thin_links,
     thin_points,
 )
 from hm_sfm.types import ImagePair, PairMatches, apply_homographies
@@ -318,6 +321,25 @@ def test_a_generous_budget_changes_nothing(scene, persisted):
     assert {name: len(found) for name, found in keypoints.items()} == {
         name: len(found) for name, found in persisted[0].items()
     }
+
+
+def test_thinned_links_are_those_that_the_budget_keeps(scene):
+    by_pair = {matches.pair: matches for matches in scene[1]}
+    config = dataclasses.replace(CONFIG, max_keypoints=40)
+    linked = link_keypoints(scene[0], list(by_pair), by_pair.__getitem__, config, quiet=True)
+    thinned = thin_links(linked, config)
+    of_all, of_thinned = (sum(len(links.source) for links in of.links) for of in (linked, thinned))
+    assert 0 < of_thinned < 0.6 * of_all
+    (keypoints, matches), (few_keypoints, few_matches) = finish_keypoints(linked, config), finish_keypoints(thinned, config)
+    for found, again in zip(keypoints, few_keypoints, strict=True):
+        np.testing.assert_allclose(found.xy, again.xy, atol=0.02)
+    for found, again in zip(matches, few_matches, strict=True):
+        assert found.pair == again.pair and np.array_equal(found.indices, again.indices)
+
+
+def test_nothing_is_thinned_to_nothing():
+    linked = link_keypoints([make_photo("a")], [], {}.__getitem__, CONFIG, quiet=True)
+    assert thin_links(linked, CONFIG).links == ()
 
 
 # Parts

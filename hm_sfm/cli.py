@@ -31,9 +31,9 @@ PHOTO_OPTIONS = (
      "near each other by GPS; those of a file with two names a line; or auto, all up to 60 images and a selection "
      "beyond"),
     ("--model", "matching.model", "light|FILE", "the network's weights: bundled ones, or a file made by hm-sfm train"),
-    ("--coarse", "matching.coarse", "light|sift|lightglue|xfeat",
+    ("--coarse", "matching.coarse", "light|sift|lightglue|xfeat|FILE",
      "what finds the matches that homographies are estimated for: the network itself, COLMAP's SIFT, ALIKED with "
-     "LightGlue, or XFeat*"),
+     "LightGlue, XFeat*, or the coarse stage of a LoFTR checkpoint"),
     ("--coarse-matches", "matching.coarse_matches", "FILE",
      "take these matches from a file instead: point pairs of any matcher, or indices, as hloc writes them"),
     ("--coarse-features", "matching.coarse_features", "FILE",

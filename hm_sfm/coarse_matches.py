@@ -2,7 +2,7 @@
 
 A provider describes each image once and turns the descriptions of two images into PointPairs; the fine stage estimates
 a homography around each of them. The network's own coarse stage is one of the providers, see NetworkCoarse in
-hm_sfm.network.model; here are the others.
+hm_sfm.network.model, that of other weights another, see hm_sfm.network.weights_coarse; here are the rest.
 """
 
 import hashlib
@@ -250,9 +250,9 @@ def check_coarse(config: MatchingConfig, pairs: Sequence[ImagePair] = ()) -> Non
 
     Nothing is loaded, so that bad input is found before anything is computed.
     """
-    if config.coarse not in NAMES:
+    if config.coarse not in NAMES and not Path(config.coarse).is_file():
         raise ConfigError(
-            f"matching.coarse must be {', '.join(NAMES[:-1])} or {NAMES[-1]}, found {config.coarse!r}: matches in a "
+            f"matching.coarse must be {', '.join(NAMES)} or a file of weights, found {config.coarse!r}: matches in a "
             "file are named with --coarse-matches"
         )
     if config.coarse_features and not config.coarse_matches:
@@ -273,12 +273,17 @@ def check_coarse(config: MatchingConfig, pairs: Sequence[ImagePair] = ()) -> Non
 def make_provider(config: MatchingConfig, device: torch.device) -> CoarseProvider | None:
     """The provider of the configuration, on a device; None is the network itself.
 
-    Raises ConfigError on an unknown name, MissingPackageError where its package is not installed, and InputError where
-    a file is missing or damaged.
+    Raises ConfigError on an unknown name, MissingPackageError where its package is not installed, InputError where a
+    file is missing or damaged, and WeightsError where one of weights is.
     """
     check_coarse(config)
     if config.coarse_matches:
         return MatchFile(Path(config.coarse_matches), Path(config.coarse_features) if config.coarse_features else None)
+    if config.coarse not in NAMES:
+        # Here, because a matcher needs this module.
+        from hm_sfm.network.weights_coarse import WeightsCoarse
+
+        return WeightsCoarse(Path(config.coarse), config, device)
     makers = {"sift": lambda _: SiftCoarse(), "lightglue": LightGlueCoarse, "xfeat": XfeatCoarse}
     return makers[config.coarse](device) if config.coarse in makers else None
 
@@ -290,6 +295,8 @@ def describe_coarse(config: MatchingConfig) -> dict[str, str]:
         return {f"matching.{key}": digest_file(Path(path)) for key, path in files.items() if path}
     if config.coarse == "light":
         return {}
+    if config.coarse not in NAMES:
+        return {"matching.coarse": digest_file(Path(config.coarse))}
     package = PACKAGES.get(config.coarse, "pycolmap").replace("_", "-")
     return {"matching.coarse": f"{config.coarse} ({package} {version(package)})"}
 

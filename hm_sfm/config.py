@@ -78,7 +78,8 @@ class MatchingConfig:
     model: str = "light"
     """Name of bundled weights, or a file."""
     coarse: str = "light"
-    """What finds the matches to estimate homographies for: light (the network itself) | sift | lightglue | xfeat."""
+    """What finds the matches to estimate homographies for: light (the network itself) | sift | lightglue | xfeat | a file
+    of weights, of LoFTR or made by hm-sfm train, whose coarse stage does."""
     coarse_matches: str = ""
     """A file with the matches of any matcher instead, as hloc or its match_dense write them;"""
     coarse_features: str = ""

@@ -115,7 +115,7 @@ def choose_variants(matcher: "HomoMatcher", sketch0: Sketch, sketch1: Sketch) ->
     def count(variant0: Variant, variant1: Variant) -> int:
         # The smaller sketch comes first: the matrix of similarities goes by its rows.
         cells0, cells1 = sorted((sketch0.get(variant0), sketch1.get(variant1)), key=Tensor.numel)
-        index0, index1 = matcher.match_coarse(cells0, cells1)
+        index0, index1, _ = matcher.match_coarse(cells0, cells1)
         return count_agreeing(place_cells(index0, cells0.shape[1]), place_cells(index1, cells1.shape[1]))
 
     counts = {way: count(*way) for way in TURNS}

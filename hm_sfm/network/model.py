@@ -208,15 +208,16 @@ class HomoMatcher:
         return coarse[0].permute(1, 2, 0).contiguous()
 
     @torch.inference_mode()
-    def match_coarse(self, coarse0: Tensor, coarse1: Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """Cells of two images that the network's own coarse stage matches: (M,) int64 of each, counted row by row.
+    def match_coarse(self, coarse0: Tensor, coarse1: Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Cells of two images that the network's own coarse stage matches: (M,) int64 of each, counted row by row, and
+        their scores (M,) float32.
 
         coarse0, coarse1: as encode_coarse makes them.
         """
         cells = (coarse.flatten(0, 1) for coarse in (coarse0, coarse1))
         with autocast(self.device):
-            index0, index1, _ = self.net.coarse.match(*cells, self.config.coarse_threshold)
-        return index0.cpu().numpy(), index1.cpu().numpy()
+            index0, index1, score = self.net.coarse.match(*cells, self.config.coarse_threshold)
+        return index0.cpu().numpy(), index1.cpu().numpy(), score.float().cpu().numpy()
 
     @torch.inference_mode()
     def match_features(self, features0: ImageFeatures, features1: ImageFeatures) -> PatchMatches:

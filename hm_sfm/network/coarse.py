@@ -5,6 +5,7 @@ A coarse stage is a module with `describe`, run once per image on the backbone's
 
 import math
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 import torch
 import torch.nn.functional as F
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 from hm_sfm.network.aspan import Flow, SpanTransformer
 from hm_sfm.network.transformer import CoarseTransformer, encode_positions, place_positions
 
-BLOCK_ROWS = 64
+BLOCK_ROWS = 128
 """Rows of the similarity matrix that are held at a time: so few stay in the processor's cache."""
 GROUP = 128
 """Columns of it among which the largest entry is found at once."""
@@ -153,10 +154,27 @@ def match_by_similarity(coarse0: Tensor, coarse1: Tensor, threshold: float, bloc
     """Mutual nearest neighbours by inner product, without ever holding the whole similarity matrix.
 
     coarse0: (N0, C), coarse1: (N1, C) float32; block: rows of the matrix held at a time. Scores are the inner products,
-    at least `threshold`.
+    at least `threshold`; within torch.autocast they are of factors in half precision, but summed up in full.
     """
-    with torch.autocast(coarse0.device.type, enabled=False):
+    with half_precision_factors(coarse0.device.type):
         return pick_mutual(multiply_blocks(coarse0, coarse1, block), coarse1, threshold)
+
+
+@contextmanager
+def half_precision_factors(device: str) -> Iterator[None]:
+    """Where autocast is on, products of float32 matrices stay float32, of factors rounded to half precision.
+
+    Autocast itself would round the products, and make equals of similarities that are not.
+    """
+    products = torch.backends.cuda.matmul if device == "cuda" else torch.backends.mkldnn.matmul
+    before = products.fp32_precision
+    if torch.is_autocast_enabled(device):
+        products.fp32_precision = "tf32" if device == "cuda" else "bf16"
+    try:
+        with torch.autocast(device, enabled=False):
+            yield
+    finally:
+        products.fp32_precision = before
 
 
 def match_by_dual_softmax(

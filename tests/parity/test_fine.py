@@ -118,6 +118,20 @@ def test_cells_match_as_mutual_nearest_neighbours_of_the_whole_matrix(block, gen
     torch.testing.assert_close(similarity, (coarse0[index0] * coarse1[index1]).sum(1))
 
 
+def test_half_precision_rounds_the_cells_alone(generator):
+    coarse0 = F.normalize(torch.randn(300, 64, generator=generator), dim=1)
+    coarse1 = F.normalize(coarse0 + 0.05 * torch.randn(300, 64, generator=generator), dim=1)
+    before = torch.backends.mkldnn.matmul.fp32_precision
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        index0, index1, similarity = match_by_similarity(coarse0, coarse1, 0.5)
+    assert torch.backends.mkldnn.matmul.fp32_precision == before
+    assert torch.equal(index0, torch.arange(300)) and torch.equal(index1, index0)
+    assert similarity.dtype == torch.float32
+    # Rounded products would be at most 2**-8 apart, so near 1: there are about 20 such numbers here.
+    assert len(similarity.unique()) > 250
+    torch.testing.assert_close(similarity, (coarse0 * coarse1).sum(1), atol=4e-3, rtol=0)
+
+
 def test_a_threshold_that_nothing_meets_matches_nothing(generator):
     coarse = F.normalize(torch.randn(9, 8, generator=generator), dim=1)
     assert len(match_by_similarity(coarse, coarse, 1.1)[0]) == 0

@@ -37,8 +37,8 @@ from hm_sfm.training.loop import TrainConfig, train
 
 SUPERVISIONS = {"semi-dense": "centre", "+ dense": "dense", "+ suppressed": "suppressed"}
 """Row -> TrainConfig.supervise."""
-SIZES = ((5, 1, 1), (9, 1, 1), (9, 1, 3), (9, 3, 1), (9, 3, 3))
-"""w, r, K."""
+SIZES = ((5, 1, 1, 1), (9, 1, 1, 1), (9, 1, 3, 1), (9, 3, 1, 1), (9, 3, 3, 1), (9, 1, 3, 2))
+"""w, r, K and network.spacing, 1 in the paper."""
 POINTS = ("PCK@1", "PCK@3", "centre@1", "centre@3", "AUC@5")
 CELLS = ("recall", "precision", "real recall", "real precision")
 
@@ -52,9 +52,10 @@ def ablate(config: TrainConfig, scene: Path, attention_weights: Path | None) -> 
     # LoFTR's head, trained as LoFTR does: a point has no homography to supervise.
     expectation = replace(config, network=replace(config.network, head="expectation"), supervise="centre")
     sizes = {"expectation": score_variant(expectation, trial)}
-    for w, r, k in SIZES:
-        network = replace(config.network, window=w, radius=r, iterations=k)
-        sizes[f"{w}/{r}/{k}"] = score_variant(replace(config, network=network), trial)
+    for w, r, k, spacing in SIZES:
+        network = replace(config.network, window=w, radius=r, iterations=k, spacing=spacing)
+        row = f"{w}/{r}/{k}" if spacing == 1 else f"{w}/{r}/{k}, spacing {spacing}"
+        sizes[row] = score_variant(replace(config, network=network), trial)
     tables = {
         "What supervises the fine stage": format_markdown(losses, POINTS),
         "The size of the fine stage: w/r/K": format_markdown(sizes, (*POINTS, "fine ms")),
@@ -78,7 +79,8 @@ def drop_head(weights: Path, path: Path) -> Path:
 def score_variant(config: TrainConfig, trial: Trial) -> Scores:
     """Train a variant of the fine stage, or what is left of it, and score it."""
     net = config.network
-    name = f"{net.head}-{net.window}-{net.radius}-{net.iterations}-{config.supervise}"
+    size = "-".join(map(str, (net.window, net.radius, net.iterations, net.spacing)))
+    name = f"{net.head}-{size}-{config.supervise}"
     config = replace(config, out=str(Path(config.out) / name))
     print(name, file=sys.stderr)
     stored = Path(config.out) / f"scores-{trial.key}.json"

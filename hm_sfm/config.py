@@ -31,8 +31,8 @@ class NetworkConfig:
     """w: side of a fine patch, cells of the 1/2 grid."""
     radius: int = 1
     """r: radius of the correlation window that is sampled at each iteration."""
-    iterations: int = 3
-    """K: homography updates."""
+    iterations: int = 2
+    """K: homography updates (the paper: 3, and weights are trained with as many; any number can be made of them)."""
     margin: int = 2
     """Cells by which the patch searched in image 1 is larger on each side (the paper: 0)."""
     spacing: int = 2

@@ -45,7 +45,7 @@ CELLS_PX = (1, 2, 4, 8)
 AUC_SHOWN_DEG = (0.25, 0.5, 1, 3)
 RESULT_FILE = "result.json"
 SECONDS_FILE = "seconds.json"
-HEAD_FIELDS = ("head", "window", "radius", "iterations", "margin")
+HEAD_FIELDS = ("head", "window", "radius", "iterations", "margin", "spacing")
 """Of NetworkConfig: what networks with different heads may differ in."""
 
 

@@ -14,33 +14,25 @@ import argparse
 import shlex
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-import torch
 from ablation_scores import (
-    Scores,
-    Trial,
-    describe_trial,
-    drop_transformer,
-    prepare_trial,
-    score_cells,
-    score_matches,
+    CELLS, POINTS, Scores, Trial, describe_trial, drop_head, drop_transformer, prepare_trial, score_matches, score_net,
     score_once,
-)
+)  # fmt: skip
 from tables import format_markdown
 
 from hm_sfm.atomic import replace_file
 from hm_sfm.config import load_config
 from hm_sfm.errors import ConfigError, HmSfmError
-from hm_sfm.network.model import digest_weights, load_weights, read_checkpoint
+from hm_sfm.network.model import digest_weights, load_weights
 from hm_sfm.training.loop import TrainConfig, train
 
 SUPERVISIONS = {"semi-dense": "centre", "+ dense": "dense", "+ suppressed": "suppressed"}
 """Row -> TrainConfig.supervise."""
 SIZES = ((5, 1, 1, 1), (9, 1, 1, 1), (9, 1, 3, 1), (9, 3, 1, 1), (9, 3, 3, 1), (9, 1, 3, 2))
 """w, r, K and network.spacing, 1 in the paper."""
-POINTS = ("PCK@1", "PCK@3", "centre@1", "centre@3", "AUC@5")
-CELLS = ("recall", "precision", "real recall", "real precision")
 
 
 def ablate(config: TrainConfig, scene: Path, attention_weights: Path | None) -> str:
@@ -64,18 +56,6 @@ def ablate(config: TrainConfig, scene: Path, attention_weights: Path | None) -> 
     return "".join(f"\n## {title}\n\n{table}\n" for title, table in tables.items() if table)
 
 
-def drop_head(weights: Path, path: Path) -> Path:
-    """Where the weights without their head lie: at `path` now, or as they are where they are a backbone's alone."""
-    content = read_checkpoint(weights)
-    if "state_dict" not in content:
-        return weights
-    state = {key: value for key, value in content["state_dict"].items() if not key.startswith("head.")}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replace_file(path) as temporary:
-        torch.save({**content, "state_dict": state}, temporary)
-    return path
-
-
 def score_variant(config: TrainConfig, trial: Trial) -> Scores:
     """Train a variant of the fine stage, or what is left of it, and score it."""
     net = config.network
@@ -94,11 +74,7 @@ def score_coarse(weights: Path, trial: Trial) -> dict[str, Scores]:
         raise ConfigError(f"{weights} has no coarse transformer: network.coarse is {net.config.coarse!r}")
     folder = Path(trial.config.out) / f"coarse-{digest_weights(str(weights))[:8]}"
     nets = {"with": net, "without": drop_transformer(net)}
-
-    def score(row: str) -> Scores:
-        return score_cells(nets[row], trial) | score_matches(nets[row], trial)
-
-    return {row: score_once(folder / f"{row}-{trial.key}.json", lambda row=row: score(row)) for row in nets}
+    return {row: score_once(folder / f"{row}-{trial.key}.json", partial(score_net, nets[row], trial)) for row in nets}
 
 
 def main() -> None:

@@ -13,10 +13,11 @@ import torch
 from tables import write_json
 from torch import Tensor
 
+from hm_sfm.atomic import replace_file
 from hm_sfm.config import ImageConfig, MatchingConfig, fingerprint
 from hm_sfm.images import prepare_image, read_ref
 from hm_sfm.network.fine import make_fine_map
-from hm_sfm.network.model import FINE_CHUNK, HomoMatcher, HomoNet, autocast, pad_image
+from hm_sfm.network.model import FINE_CHUNK, HomoMatcher, HomoNet, autocast, pad_image, read_checkpoint
 from hm_sfm.pair_evaluation import PosePair, read_strecha_pairs, score_poses
 from hm_sfm.training.loop import TrainConfig, run_fingerprint
 from hm_sfm.training.losses import DENSE_RADIUS
@@ -33,6 +34,9 @@ PAIRS = 48
 LIMITS_PX = (1, 3)
 TIMED_PATCHES = 2000
 TIMED_CALLS = 9
+
+POINTS = ("PCK@1", "PCK@3", "centre@1", "centre@3", "AUC@5")
+CELLS = ("recall", "precision", "real recall", "real precision")
 
 Scores = dict[str, float]
 
@@ -100,6 +104,11 @@ def score_cells(net: HomoNet, trial: Trial) -> Scores:
     threshold, precision = matcher.config.coarse_threshold, trial.config.precision
     scores = score_network(net, batches, "coarse", 0, threshold, precision, matcher.device, torch.Generator())
     return {name.replace("rendered_", "").replace("_", " "): value for name, value in scores.items()}
+
+
+def score_net(net: HomoNet, trial: Trial) -> Scores:
+    """All figures of a network: CELLS, and what score_matches measures."""
+    return score_cells(net, trial) | score_matches(net, trial)
 
 
 def score_matches(net: HomoNet, trial: Trial) -> Scores:
@@ -174,6 +183,18 @@ def drop_transformer(net: HomoNet) -> HomoNet:
     plain = HomoNet(replace(net.config, coarse="cosine"))
     plain.load_state_dict({key: value for key, value in net.state_dict().items() if not key.startswith("coarse.")})
     return plain
+
+
+def drop_head(weights: Path, path: Path) -> Path:
+    """Where the weights without their head lie: at `path` now, or as they are where they are a backbone's alone."""
+    content = read_checkpoint(weights)
+    if "state_dict" not in content:
+        return weights
+    state = {key: value for key, value in content["state_dict"].items() if not key.startswith("head.")}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(path) as temporary:
+        torch.save({**content, "state_dict": state}, temporary)
+    return path
 
 
 def describe_trial(config: TrainConfig, scene: Path, command: str) -> str:

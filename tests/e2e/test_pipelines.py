@@ -131,7 +131,7 @@ def ablate(scene, tmp_path, monkeypatch, capfd):
     scores, recipe = importlib.import_module("ablation_scores"), importlib.import_module("ablate")
     for name, value in {"PAIRS": 2, "SIZE_WH": (160, 128), "TIMED_PATCHES": 40, "TIMED_CALLS": 1}.items():
         monkeypatch.setattr(scores, name, value)
-    monkeypatch.setattr(recipe, "SIZES", ((9, 1, 3, 2),))
+    monkeypatch.setattr(recipe, "SIZES", ((9, 1, 2, 2),))
     monkeypatch.setattr(loop, "HELD_OUT_PAIRS", 2)
     monkeypatch.setattr(loop, "draw_curves", lambda *paths: None)
     strecha, photos = tmp_path / "courtyard", tmp_path / "photos"
@@ -172,7 +172,7 @@ def test_ablate(ablate, tmp_path, monkeypatch, matched_pairs):
     assert report.endswith(f"{tables}\n") and f"    python ablate.py {tmp_path / 'train.yaml'} --scene" in report
     cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tables.splitlines() if line.startswith("|")]
     assert [line[0] for line in cells if not line[0].startswith("-")] == [
-        "", "semi-dense", "+ dense", "+ suppressed", "", "expectation", "9/1/3, spacing 2", "", "with", "without",
+        "", "semi-dense", "+ dense", "+ suppressed", "", "expectation", "9/1/2, spacing 2", "", "with", "without",
     ]  # fmt: skip
     assert cells[0][1:] == ["PCK@1", "PCK@3", "centre@1", "centre@3", "AUC@5"]
     assert cells[5][-1] == "fine ms" and cells[9][1:3] == ["recall", "precision"] and cells[9][-1] == "coarse ms"
@@ -180,8 +180,8 @@ def test_ablate(ablate, tmp_path, monkeypatch, matched_pairs):
     # What the first table's last row tells is the same network.
     assert cells[4][1:] == cells[8][1:-1]
     trained = sorted(path.parent.name for path in (tmp_path / "variants").glob("*/weights.pt"))
-    assert trained == ["expectation-9-1-3-2-centre"] + [
-        f"homography-9-1-3-2-{supervise}" for supervise in ("centre", "dense", "suppressed")
+    assert trained == ["expectation-9-1-2-2-centre"] + [
+        f"homography-9-1-2-2-{supervise}" for supervise in ("centre", "dense", "suppressed")
     ]
 
     # The variants have the features in common that they start from; all heads start new.

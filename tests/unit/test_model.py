@@ -213,7 +213,7 @@ def test_the_fast_configuration_matches_a_shifted_image():
     found = fast.match(texture[:, :240], texture[:, 20:])
     good = found.score >= config.verification.min_score
     assert good.sum() > 300
-    assert np.mean(np.linalg.norm(found.xy1 - (found.xy0 - [20, 0]), axis=1)[good] < 1) > 0.95
+    assert np.mean(np.linalg.norm(found.xy1 - (found.xy0 - [20, 0]), axis=1)[good] < 1) > 0.9
 
 
 def test_matches_come_best_first(matcher):

@@ -46,8 +46,7 @@ def ablate(config: TrainConfig, scene: Path, attention_weights: Path | None) -> 
     sizes = {"expectation": score_variant(expectation, trial)}
     for w, r, k, spacing in SIZES:
         network = replace(config.network, window=w, radius=r, iterations=k, spacing=spacing)
-        row = f"{w}/{r}/{k}" if spacing == 1 else f"{w}/{r}/{k}, spacing {spacing}"
-        sizes[row] = score_variant(replace(config, network=network), trial)
+        sizes[f"{w}/{r}/{k}" + f", spacing {spacing}" * (spacing > 1)] = score_variant(replace(config, network=network), trial)
     tables = {
         "What supervises the fine stage": format_markdown(losses, POINTS),
         "The size of the fine stage: w/r/K": format_markdown(sizes, (*POINTS, "fine ms")),
@@ -60,9 +59,8 @@ def score_variant(config: TrainConfig, trial: Trial) -> Scores:
     """Train a variant of the fine stage, or what is left of it, and score it."""
     net = config.network
     size = "-".join(map(str, (net.window, net.radius, net.iterations, net.spacing)))
-    name = f"{net.head}-{size}-{config.supervise}"
-    config = replace(config, out=str(Path(config.out) / name))
-    print(name, file=sys.stderr)
+    config = replace(config, out=str(Path(config.out) / f"{net.head}-{size}-{config.supervise}"))
+    print(config.out, file=sys.stderr)
     stored = Path(config.out) / f"scores-{trial.key}.json"
     return score_once(stored, lambda: score_matches(load_weights(str(train(config, resume=True))), trial))
 

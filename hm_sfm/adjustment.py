@@ -4,6 +4,8 @@ A keypoint that was carried through several pairs has several predictions of its
 one homography. Together they pin it down better than any of them.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 PRIOR_WEIGHT = 0.01
@@ -13,6 +15,21 @@ FULL_TRUST_PX = 0.25
 """Expected error of a prediction at which its weight is a half; 1 is the weight of an exact one."""
 ROBUST_SCALE = 0.5
 """Residual, in the unit of the coordinates, beyond which a prediction loses weight (Cauchy)."""
+ANCHOR_WEIGHT = 0.5
+"""Of where a detector saw a keypoint: off by FULL_TRUST_PX, as SIFT's are."""
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Keypoints that a detector located in their own image, at most once each."""
+
+    keypoint: np.ndarray
+    """(A,) int64."""
+    xy: np.ndarray
+    """(A, 2)."""
+
+
+NO_ANCHORS = Anchors(np.zeros(0, np.int64), np.zeros((0, 2)))
 
 
 def weigh_scores(score: np.ndarray) -> np.ndarray:
@@ -26,9 +43,9 @@ def weigh_scores(score: np.ndarray) -> np.ndarray:
 
 def adjust_keypoints(
     xy: np.ndarray, source: np.ndarray, target: np.ndarray, predicted: np.ndarray, jacobian: np.ndarray,
-    weight: np.ndarray, rounds: int,
+    weight: np.ndarray, rounds: int, anchors: Anchors = NO_ANCHORS,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Move keypoints to agree with their links, in so many rounds.
+    """Move keypoints to agree with their links and anchors, in so many rounds.
 
     xy: (K, 2) positions; link e says that keypoint target[e] lies at predicted[e] + jacobian[e] (x - xy[source[e]])
     when its source lies at x: source, target (E,) int64, predicted (E, 2), jacobian (E, 2, 2), weight (E,).
@@ -40,23 +57,26 @@ def adjust_keypoints(
     inverse = np.linalg.inv(jacobian)
     moved = xy.astype(np.float64).copy()
     count = len(xy)
-    ends = np.concatenate([target, source])
+    ends = np.concatenate([target, source, anchors.keypoint])
     links_at = np.bincount(ends, minlength=count)
     for number in range(rounds + 1):
         forward = predict_targets(xy, moved, source, predicted, jacobian)
         residual = np.linalg.norm(forward - moved[target], axis=1)
+        apart = np.linalg.norm(anchors.xy - moved[anchors.keypoint], axis=1)
         robust = weight / (1 + (residual / ROBUST_SCALE) ** 2)
-        trust = np.tile(robust, 2)
+        anchored = ANCHOR_WEIGHT / (1 + (apart / ROBUST_SCALE) ** 2)
+        trust = np.concatenate([robust, robust, anchored])
         total = np.bincount(ends, trust, count) + PRIOR_WEIGHT
         if number == rounds:
             break
         backward = xy[source] + np.einsum("eij,ej->ei", inverse, moved[target] - predicted)
-        says = np.concatenate([forward, backward])
+        says = np.concatenate([forward, backward, anchors.xy])
         for axis in range(2):
             mean = (np.bincount(ends, trust * says[:, axis], count) + PRIOR_WEIGHT * xy[:, axis]) / total
             # Less than a full step: two linked keypoints that both move to the other's wish would swap for ever.
             moved[:, axis] += STEP * (mean - moved[:, axis])
-    spread = np.bincount(ends, np.tile(robust * residual**2, 2), count) + PRIOR_WEIGHT * ROBUST_SCALE**2
+    squared = trust * np.concatenate([residual, residual, apart]) ** 2
+    spread = np.bincount(ends, squared, count) + PRIOR_WEIGHT * ROBUST_SCALE**2
     return moved, np.sqrt(spread / total / np.maximum(links_at, 1))
 
 

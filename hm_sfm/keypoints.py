@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from hm_sfm.adjustment import adjust_keypoints, measure_residuals, weigh_scores
+from hm_sfm.adjustment import Anchors, adjust_keypoints, measure_residuals, weigh_scores
 from hm_sfm.budget import choose_budget
 from hm_sfm.config import KeypointConfig
 from hm_sfm.coordinates import px_from_pixel_index
@@ -29,6 +29,8 @@ SEED_CELL_PX = 8
 AGREEMENT_PX = 0.5
 """Distance from the mean at which a patch's say on a carried point counts half."""
 AGREEMENT_ROUNDS = 3
+ANCHOR_PX = 1.0
+"""How far from an exact seed a keypoint may be founded that is meant to be the same point."""
 LEAST_AGREEMENT = 0.8
 """Share of the patches, by weight, that must agree: at the edges of things, where depth jumps, they don't."""
 
@@ -48,6 +50,8 @@ class Photo:
     """(N, 2) px of the stored image -> (N,) bool: where no keypoint may be, in masked pixels; None: nowhere."""
     finer: float = 1.0
     """Units per px of the matching resolution."""
+    seeds_are_exact: bool = False
+    """Whether a detector located the seeds to a fraction of a pixel, so that keypoints near them are held there."""
 
     def allows(self, xy: np.ndarray) -> np.ndarray:
         """(N,) bool: whether keypoints may lie at xy, (N, 2) units: within the image and not masked."""
@@ -396,6 +400,7 @@ def settle_tracks(linked: LinkedKeypoints, config: KeypointConfig) -> SettledTra
         jacobian[same],
         weigh_scores(score[same]),
         config.adjustment_rounds,
+        find_anchors(photos, linked.xy),
     )
     residual = measure_residuals(xy, moved, source, target, predicted, jacobian)
     finer = np.repeat([photo.finer for photo in photos], counts)
@@ -410,6 +415,24 @@ def settle_tracks(linked: LinkedKeypoints, config: KeypointConfig) -> SettledTra
     kept[kept] = choose_budget(label[kept], length[kept], sigma[kept], spread, image[kept], config.max_keypoints)
     used = agreed & (label[source] == label[target]) & kept[source] & kept[target]
     return SettledTracks(image, label, moved, sigma, kept, source, target, score, used)
+
+
+def find_anchors(photos: Sequence[Photo], xy: Sequence[np.ndarray]) -> Anchors:
+    """The exact seeds that lie within ANCHOR_PX of a keypoint, each the other's nearest.
+
+    xy: by photo, (K, 2) units; the anchors' indices count the keypoints of all photos.
+    """
+    keypoint, places, first = [np.zeros(0, np.int64)], [np.zeros((0, 2))], 0
+    for photo, points in zip(photos, xy):
+        if photo.seeds_are_exact:
+            seeds = photo.seeds / photo.px_per_unit
+            nearest, _ = find_nearest(points, seeds, ANCHOR_PX * photo.finer)
+            back, _ = find_nearest(seeds, points, ANCHOR_PX * photo.finer)
+            held = np.flatnonzero(np.append(back, -1)[nearest] == np.arange(len(points)))
+            keypoint.append(first + held)
+            places.append(seeds[nearest[held]])
+        first += len(points)
+    return Anchors(np.concatenate(keypoint), np.concatenate(places))
 
 
 def group_matches(

@@ -305,7 +305,7 @@ def carry_keypoints(
     """persist_keypoints over the verified pairs, strongest first. Raises InputError on an undecodable photo.
 
     store: what the pairs were verified with. masks: no keypoint lies in a masked pixel. seeds: by image name, (N, 2) px
-    of the stored image, best first, the points that keypoints may be founded at; None finds them in the photos.
+    of the stored image, best first, the points that keypoints may be founded at, exact ones; None finds some in the photos.
 
     Returns the Keypoints of every image, in the order of `images`, and the IndexMatches of the pairs that share tracks.
     """
@@ -317,6 +317,7 @@ def carry_keypoints(
             px_per_unit[image.name],
             find_seeds(prepare_image(image, config.images.long_edge_px)) if seeds is None else seeds[image.name],
             partial(masks.hides, image.name) if image.name in masks.packed else None,
+            seeds_are_exact=seeds is not None,
         )
         for image in tqdm(images, desc="seeds", unit="image", disable=quiet)
     ]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hm_sfm.adjustment import adjust_keypoints, measure_residuals, predict_targets
+from hm_sfm.adjustment import Anchors, adjust_keypoints, measure_residuals, predict_targets
 from hm_sfm.config import KeypointConfig
 
 ROUNDS = KeypointConfig().adjustment_rounds
@@ -91,6 +91,31 @@ def test_a_heavier_link_counts_more():
     jacobian = np.tile(np.eye(2), (2, 1, 1))
     moved, _ = adjust_keypoints(xy, source, target, predicted, jacobian, np.array([1.0, 0.2]), ROUNDS)
     assert moved[2, 0] > 0.01
+
+
+def test_what_a_detector_saw_in_each_image_makes_up_for_errors_that_links_share():
+    rng = np.random.default_rng(4)
+    truth = rng.uniform(0, 100, (6, 2))
+    source, target = all_links(6)
+    jacobian = np.tile(np.eye(2), (len(source), 1, 1))
+    xy = truth + rng.normal(0, 0.2, truth.shape)
+    predicted = make_links(truth, source, target, jacobian, xy, 0.3, rng)
+    weight = np.full(len(source), 0.2)
+    seen = Anchors(np.arange(1, 6), truth[1:] + rng.normal(0, 0.05, (5, 2)))
+    free, _ = adjust_keypoints(xy, source, target, predicted, jacobian, weight, ROUNDS)
+    held, sigma = adjust_keypoints(xy, source, target, predicted, jacobian, weight, ROUNDS, seen)
+    assert np.linalg.norm(held - truth, axis=1).mean() < 0.6 * np.linalg.norm(free - truth, axis=1).mean()
+    assert sigma[1:].mean() < sigma[0]
+
+
+def test_a_detection_far_from_what_the_links_say_hardly_counts():
+    truth = np.random.default_rng(3).uniform(0, 100, (6, 2))
+    source, target = all_links(6)
+    jacobian = np.tile(np.eye(2), (len(source), 1, 1))
+    predicted = make_links(truth, source, target, jacobian, truth)
+    off = Anchors(np.array([2]), truth[[2]] + (6.0, 8.0))
+    moved, _ = adjust_keypoints(truth, source, target, predicted, jacobian, np.ones(len(source)), ROUNDS, off)
+    assert np.linalg.norm(moved - truth, axis=1).max() < 0.05
 
 
 def test_keypoints_without_links_stay():

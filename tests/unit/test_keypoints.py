@@ -11,6 +11,7 @@ from hm_sfm.images import prepare_array
 from hm_sfm.keypoints import (
     Photo,
     differentiate,
+    find_anchors,
     find_seeds,
     finish_keypoints,
     group_matches,
@@ -321,6 +322,30 @@ def test_a_generous_budget_changes_nothing(scene, persisted):
     assert {name: len(found) for name, found in keypoints.items()} == {
         name: len(found) for name, found in persisted[0].items()
     }
+
+
+def test_keypoints_end_at_exact_seeds():
+    seeds = {"a": (40.0, 40.0), "b": (50.3, 40.2)}
+    pair = make_pair("a", "b", shift(10, 0))
+    for exact in (False, True):
+        photos = [dataclasses.replace(make_photo(name, seed), seeds_are_exact=exact) for name, seed in seeds.items()]
+        keypoints, _, tracks = persist(photos, [pair])
+        assert len(tracks) == 1
+        apart = keypoints["b"].xy[0] - keypoints["a"].xy[0] - (10, 0)
+        assert np.linalg.norm(apart) < 0.03 if not exact else 0.1 < np.linalg.norm(apart) < 0.36
+
+
+def test_anchors_are_the_nearest_exact_seeds_of_the_own_photo():
+    photos = [
+        dataclasses.replace(make_photo("a", (10, 10), (30, 30), (50, 50), px_per_unit=2.0), seeds_are_exact=True),
+        make_photo("b", (10, 10)),
+        dataclasses.replace(make_photo("c", (10, 10)), seeds_are_exact=True),
+    ]
+    # Of two near one seed the nearer is held; one is too far from any.
+    xy = [np.array([[5.4, 5.0], [5.1, 5.0], [15.0, 16.5]]), np.array([[10.0, 10.0]]), np.array([[10.2, 10.0]])]
+    anchors = find_anchors(photos, xy)
+    assert anchors.keypoint.tolist() == [1, 4]
+    assert anchors.xy.tolist() == [[5, 5], [10, 10]]
 
 
 def test_thinned_links_are_those_that_the_budget_keeps(scene):

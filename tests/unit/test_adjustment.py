@@ -104,7 +104,7 @@ def test_what_a_detector_saw_in_each_image_makes_up_for_errors_that_links_share(
     seen = Anchors(np.arange(1, 6), truth[1:] + rng.normal(0, 0.05, (5, 2)))
     free, _ = adjust_keypoints(xy, source, target, predicted, jacobian, weight, ROUNDS)
     held, sigma = adjust_keypoints(xy, source, target, predicted, jacobian, weight, ROUNDS, seen)
-    assert np.linalg.norm(held - truth, axis=1).mean() < 0.6 * np.linalg.norm(free - truth, axis=1).mean()
+    assert np.linalg.norm(held - truth, axis=1).mean() < 0.8 * np.linalg.norm(free - truth, axis=1).mean()
     assert sigma[1:].mean() < sigma[0]
 
 

@@ -332,7 +332,7 @@ def test_keypoints_end_at_exact_seeds():
         keypoints, _, tracks = persist(photos, [pair])
         assert len(tracks) == 1
         apart = keypoints["b"].xy[0] - keypoints["a"].xy[0] - (10, 0)
-        assert np.linalg.norm(apart) < 0.03 if not exact else 0.1 < np.linalg.norm(apart) < 0.36
+        assert np.linalg.norm(apart) < 0.03 if not exact else 0.05 < np.linalg.norm(apart) < 0.36
 
 
 def test_anchors_are_the_nearest_exact_seeds_of_the_own_photo():

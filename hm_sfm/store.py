@@ -24,6 +24,8 @@ from hm_sfm.errors import InputError, StaleResultError
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
 VERSION = 1
+MERGED_AT_ONCE = 500
+"""Pairs after which the files are closed and opened again: HDF5 holds on to 20 KB of memory for each until then."""
 
 
 def digest_image(image: ImageRef) -> str:
@@ -138,13 +140,15 @@ class MatchStore:
             by_file.setdefault(file, []).append(pair)
         with name_disk_errors(self.path):
             require_room(self.path, sum(file.stat().st_size for file in by_file))
-        with name_disk_errors(self.path), replace_file(self.path) as temporary, h5py.File(temporary, "w") as merged:
-            self._stamp(merged)
+        with name_disk_errors(self.path), replace_file(self.path) as temporary:
+            with h5py.File(temporary, "w") as merged:
+                self._stamp(merged)
             for file, pairs in by_file.items():
-                with h5py.File(file, "r") as h5:
-                    for pair in pairs:
-                        h5.copy(self._where[pair][1], merged, groups[pair])
-                        where[pair] = (self.path, groups[pair])
+                for first in range(0, len(pairs), MERGED_AT_ONCE):
+                    with h5py.File(file, "r") as h5, h5py.File(temporary, "a") as merged:
+                        for pair in pairs[first : first + MERGED_AT_ONCE]:
+                            h5.copy(self._where[pair][1], merged, groups[pair])
+                            where[pair] = (self.path, groups[pair])
         self._where = where
         shutil.rmtree(self.parts, ignore_errors=True)
 

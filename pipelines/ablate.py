@@ -2,7 +2,7 @@
 
     python pipelines/ablate.py configs/train_ablations.yaml --scene SCENE --attention-weights FILE
 
-Every variant of the fine stage starts from the same features, with a new head, and is trained for the same few steps. FILE holds a trained
+Every variant of the fine stage starts from the same features with a new head, for the same few steps. FILE holds a trained
 coarse transformer: its network is judged with it, and without it by mutual nearest neighbours of the plain features;
 without FILE there is no third table. SCENE has the layout of Strecha's data sets: images/, gt_dense_cameras/ and K.txt.
 

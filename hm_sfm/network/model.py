@@ -31,6 +31,8 @@ from hm_sfm.variants import Sketch, match_again, show_image
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 FINE_CHUNK = 512
 """Patches per call of the fine head: bounds its memory to about 50 MB."""
+FINE_STEP = 64
+"""Calls with fewer are filled up to a multiple of this: PyTorch keeps memory for every number it was ever called with."""
 GROWING_SCORE = 0.5
 """Matches at least as good as this spread to their neighbours."""
 GROWING_ROUNDS = 8
@@ -230,7 +232,7 @@ class HomoMatcher:
 
         refine = partial(self.estimate_patches, features0.fine, features1.fine)
         start = None
-        if isinstance(head, HomographyHead):
+        if isinstance(head, HomographyHead) and (coarse.linear is not None or rest0.any() or rest1.any()):
             start = make_start(rest0, rest1, coarse.linear, head.half).to(self.device)
         homography, log_scale = refine(cell0, cell1, start)
         good = scale_from_score(GROWING_SCORE, backbone.fine_grid)
@@ -256,12 +258,15 @@ class HomoMatcher:
         homography, log_scale = [torch.zeros(0, 3, 3, device=self.device)], [torch.zeros(0, device=self.device)]
         for first in range(0, len(cell0), FINE_CHUNK):
             chunk = slice(first, first + FINE_CHUNK)
-            image = torch.zeros(len(cell0[chunk]), dtype=torch.int64, device=self.device)
-            begin = {} if start is None else {"start": start[chunk]}
+            count = len(cell0[chunk])
+            padding = (0, 0, 0, -count % FINE_STEP)
+            image = torch.zeros(count + padding[-1], dtype=torch.int64, device=self.device)
+            cells = (F.pad(cell[chunk], padding) for cell in (cell0, cell1))
+            begin = {} if start is None else {"start": F.pad(start[chunk], (0, 0, *padding))}
             with autocast(self.device):
-                estimate = self.net.head(fine0, fine1, image, cell0[chunk], cell1[chunk], **begin)[-1]
-            homography.append(estimate.homography)
-            log_scale.append(estimate.log_scale)
+                estimate = self.net.head(fine0, fine1, image, *cells, **begin)[-1]
+            homography.append(estimate.homography[:count])
+            log_scale.append(estimate.log_scale[:count])
         return torch.cat(homography), torch.cat(log_scale)
 
     def _to_stored(self, features0, features1, cell0, rest0, cell1, homography, log_scale, regular) -> PatchMatches:

@@ -76,12 +76,35 @@ def test_pooled_cells_sit_where_the_head_samples_them():
     assert pooled.tolist() == [2 * k + 0.5 for k in range(4)]
 
 
+@pytest.mark.parametrize("window, radius, spacing, margin", [(5, 1, 1, 0), (9, 1, 2, 2), (9, 3, 1, 2), (9, 0, 4, 1)])
+def test_the_first_look_is_a_look_up_of_what_has_not_moved(window, radius, spacing, margin, generator):
+    head = HomographyHead(window, radius, 1, margin, spacing)
+    side, points = window + 2 * margin, len(head.grid)
+    full = with_zero(torch.randn(3, points, side, side, generator=generator))
+    expected = head.look_up(full, full @ head.pooling, head.grid.expand(3, -1, -1))
+    found = torch.einsum("pnc,ncs->pns", full, head.first_look)
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("spacing", [1, 2])
+def test_to_start_from_no_displacement_is_to_start_from_nothing(spacing, generator):
+    head = HomographyHead(9, 1, 2, 2, spacing)
+    fine = make_fine_map(torch.randn(1, 48, 24, 24, generator=generator))
+    cell = torch.tensor([[12, 11], [3, 20]])
+    index = torch.zeros(2, dtype=torch.int64)
+    pairs = zip(head(fine, fine, index, cell, cell + 1), head(fine, fine, index, cell, cell + 1, torch.zeros(2, 4, 2)))
+    for found, expected in pairs:
+        torch.testing.assert_close(vars(found), vars(expected), atol=1e-5, rtol=0)
+
+
 def test_patches_equal_a_naive_loop_also_across_the_border(generator):
     fine = torch.randn(2, 3, 6, 9, generator=generator)
     centre = torch.tensor([[4, 3], [0, 0], [8, 5], [-1, 2], [9, 6], [-40, 3], [4, 1000], [2, -3]])
     image_index = torch.tensor([0, 1, 0, 1, 0, 1, 0, 1])
     found = gather_patches(make_fine_map(fine), image_index, centre, 5)
     assert found.shape == (8, 25, 3)
+    with_a_zero = gather_patches(make_fine_map(fine), image_index, centre, 5, add_zero=True)
+    assert torch.equal(with_a_zero, F.pad(found, (0, 0, 0, 1)))
     for patch, image, (x, y) in zip(found, image_index, centre.tolist()):
         cells = [(x + i, y + j) for j in range(-2, 3) for i in range(-2, 3)]
         for value, (column, row) in zip(patch, cells):

@@ -14,6 +14,7 @@ from hm_sfm.network.coarse import match_by_similarity
 from hm_sfm.network.fine import (
     ExpectationHead,
     HomographyHead,
+    convolve,
     correlate_patches,
     gather_patches,
     make_fine_map,
@@ -95,6 +96,16 @@ def test_to_start_from_no_displacement_is_to_start_from_nothing(spacing, generat
     pairs = zip(head(fine, fine, index, cell, cell + 1), head(fine, fine, index, cell, cell + 1, torch.zeros(2, 4, 2)))
     for found, expected in pairs:
         torch.testing.assert_close(vars(found), vars(expected), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("side, stride, pad", [(3, 1, 1), (3, 2, 1), (2, 1, 0), (3, 1, 0)])
+def test_convolutions_are_the_same_without_gradients(side, stride, pad, generator):
+    torch.manual_seed(0)
+    layer = torch.nn.Conv2d(6, 4, side, stride=stride, padding=pad)
+    maps = torch.randn(2, 5, 5, 6, generator=generator)
+    with torch.inference_mode():
+        found = convolve(maps, layer)
+    torch.testing.assert_close(found, convolve(maps, layer).detach(), atol=1e-5, rtol=0)
 
 
 def test_patches_equal_a_naive_loop_also_across_the_border(generator):

@@ -121,11 +121,13 @@ class VerificationConfig:
 class KeypointConfig:
     """Persistence. Distances in px of the matching resolution, scaled to each photo."""
 
+    carry_score: float = 0.7
+    """Patches with a lower score carry no points, but for the best ones of pairs that have few."""
     carry_radius_px: float = 8.0
     """A patch carries points no farther than this from its centre."""
     join_radius_px: float = 1.0
     separation_px: float = 2.0
-    seed_spacing_px: float = 5.0
+    seed_spacing_px: float = 3.0
     """A patch seeds a keypoint where none is nearer than this."""
     adjustment_rounds: int = 15
     """Of the joint adjustment of each track's keypoints; 0 leaves them where they were first predicted."""

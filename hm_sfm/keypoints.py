@@ -26,6 +26,8 @@ from hm_sfm.tracks import label_tracks, measure_lengths
 from hm_sfm.types import ImagePair, IndexMatches, Keypoints, PairMatches, apply_homographies
 
 SEED_CELL_PX = 8
+CARRYING = 100
+"""Matches of a pair that carry keypoints, however good they are."""
 AGREEMENT_PX = 0.5
 """Distance from the mean at which a patch's say on a carried point counts half."""
 AGREEMENT_ROUNDS = 3
@@ -190,6 +192,16 @@ def thin_points(xy: np.ndarray, spacing: float) -> np.ndarray:
     return keep
 
 
+def choose_carrying(score: np.ndarray, least_score: float) -> np.ndarray:
+    """Which of a pair's verified matches carry keypoints, by their scores (N,): (N,) bool.
+
+    Those of least_score or more: a track is as exact as its worst observation. Of few good ones, the best CARRYING.
+    """
+    carrying = score >= least_score
+    carrying[np.argsort(-score, kind="stable")[:CARRYING]] = True
+    return carrying
+
+
 def make_carriers(matches: PairMatches, px_per_unit0: float, px_per_unit1: float) -> tuple[Carrier, Carrier]:
     """The carriers of verified matches, from image 0 to image 1 and back."""
     scale0, scale1 = np.diag([px_per_unit0, px_per_unit0, 1.0]), np.diag([px_per_unit1, px_per_unit1, 1.0])
@@ -309,7 +321,9 @@ def link_keypoints(
     links: list[Links] = []
     for pair in tqdm(ranked_pairs, desc="keypoints", unit="pair", disable=quiet):
         ends = index_of[pair.name0], index_of[pair.name1]
-        carriers = make_carriers(read_verified(pair), *(photos[i].px_per_unit for i in ends))
+        matches = read_verified(pair)
+        matches = matches.select(choose_carrying(matches.score, config.carry_score))
+        carriers = make_carriers(matches, *(photos[i].px_per_unit for i in ends))
         turn = strength[ends[1]] > strength[ends[0]]
         first, second = ends[::-1] if turn else ends
         links += walk_pair(first, second, carriers[::-1] if turn else carriers, photos, growing, seeds[first], config)

@@ -9,7 +9,9 @@ from hm_sfm.budget import choose_budget, rank_in_groups
 from hm_sfm.config import KeypointConfig
 from hm_sfm.images import prepare_array
 from hm_sfm.keypoints import (
+    CARRYING,
     Photo,
+    choose_carrying,
     differentiate,
     find_anchors,
     find_seeds,
@@ -397,6 +399,31 @@ def test_the_budget_of_nothing():
 
 def test_ranks_start_anew_in_every_group():
     assert rank_in_groups(np.array([3, 3, 3, 5, 7, 7])).tolist() == [0, 1, 2, 0, 0, 1]
+
+
+def test_good_matches_carry_and_of_few_good_ones_the_best():
+    rng = np.random.default_rng(0)
+    many_good = rng.permutation(np.linspace(0.5, 1.0, 4 * CARRYING))
+    assert np.array_equal(choose_carrying(many_good, 0.7), many_good >= 0.7)
+    few_good = rng.permutation(np.linspace(0.5, 0.75, 4 * CARRYING))
+    assert sorted(few_good[choose_carrying(few_good, 0.7)]) == sorted(few_good)[-CARRYING:]
+    assert choose_carrying(few_good[:7], 0.7).all()
+    assert choose_carrying(np.zeros(0), 0.7).shape == (0,)
+
+
+def test_doubtful_patches_carry_nothing_where_there_are_better_ones():
+    """Doubtful patches shift by 5 px more, and lie where the seed is."""
+    sure, doubtful = make_pair("a", "b", shift(7, 0)), make_pair("a", "b", shift(12, 0), score=0.6)
+    around = np.linalg.norm(sure.xy0 - (40, 30), axis=1) < 25
+    sure = sure.select(np.repeat(np.flatnonzero(~around), 3))
+    assert len(sure) > CARRYING
+    joined = {
+        field: np.concatenate([getattr(sure, field), getattr(doubtful, field)])
+        for field in ("xy0", "xy1", "score", "homography")
+    }
+    photos = [make_photo("a", (40.0, 30.0)), make_photo("b")]
+    assert not persist(photos, [dataclasses.replace(sure, **joined)])[2]
+    assert len(persist(photos, [doubtful])[2]) == 1
 
 
 def test_thinning_keeps_the_best_and_the_distance():

@@ -174,8 +174,13 @@ def test_ctrl_c_leaves_the_earlier_models_and_nothing_else(tmp_path, oracle):
         registered.append(1)
         signal.raise_signal(signal.SIGINT)
 
-    with pytest.raises(KeyboardInterrupt):
-        map_incrementally(path, tmp_path, tmp_path / "sparse", MappingConfig(), True, on_image=interrupt)
+    # Shells start jobs in the background deaf to Ctrl-C.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            map_incrementally(path, tmp_path, tmp_path / "sparse", MappingConfig(), True, on_image=interrupt)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert len(registered) == 1
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["database.db", "sparse"]
     assert (tmp_path / "sparse" / "0").is_dir()

@@ -122,7 +122,8 @@ class KeypointConfig:
     """Persistence. Distances in px of the matching resolution, scaled to each photo."""
 
     carry_score: float = 0.7
-    """Patches with a lower score carry no points, but for the best ones of pairs that have few."""
+    """Patches with a lower score carry no points, but for the best ones of pairs that have few. hm-sfm refine does
+    without it: it begins with matches that were verified."""
     carry_radius_px: float = 8.0
     """A patch carries points no farther than this from its centre."""
     join_radius_px: float = 1.0

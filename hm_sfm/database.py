@@ -20,8 +20,9 @@ from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.rigs import assign_cameras, read_rigs
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
-# COLMAP's guess of a focal length that nothing is known about, relative to the longer side.
-DEFAULT_FOCAL_RATIO = 1.2
+# The first guess of a focal length that nothing is known about, relative to the longer side. COLMAP's 1.2 is too long
+# for most phones and videos, which have 0.5 to 1.1: adjustment of a flat scene may then run off to a telephoto lens.
+DEFAULT_FOCAL_RATIO = 0.9
 
 # What SQLite leaves beside a database whose writer was killed; beside a new file they would damage it.
 SQLITE_LEFTOVERS = ("-wal", "-shm", "-journal")
@@ -56,8 +57,8 @@ def make_cameras(images: Sequence[ImageRef], config: CameraConfig) -> Cameras:
 
     Modes: `single`, `per-folder` and `per-image` say it all. `auto` takes one camera where all images agree in size
     and EXIF lens (or have none), and otherwise one per folder, size and lens. The focal length comes from EXIF, or is
-    COLMAP's default, to be refined. `config.params` are known intrinsics for every camera; EXIF is then not read.
-    `config.file` and `config.poses` name a COLMAP model that has them; it also says which images share a camera.
+    0.9 times the longer side, to be refined. `config.params` are known intrinsics for every camera; EXIF is then not
+    read. `config.file` and `config.poses` name a COLMAP model that has them; it also says which images share a camera.
     `config.rig` names a rig configuration: each camera of a rig is then a camera for itself; its intrinsics, where the
     configuration has them, are refined.
 

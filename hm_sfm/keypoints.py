@@ -195,7 +195,7 @@ def thin_points(xy: np.ndarray, spacing: float) -> np.ndarray:
 def choose_carrying(score: np.ndarray, least_score: float) -> np.ndarray:
     """Which of a pair's verified matches carry keypoints, by their scores (N,): (N,) bool.
 
-    Those of least_score or more: a track is as exact as its worst observation. Of few good ones, the best CARRYING.
+    Those of least_score or more: a track is as exact as its worst observation. Where fewer are, the best CARRYING.
     """
     carrying = score >= least_score
     carrying[np.argsort(-score, kind="stable")[:CARRYING]] = True
@@ -322,7 +322,9 @@ def link_keypoints(
     for pair in tqdm(ranked_pairs, desc="keypoints", unit="pair", disable=quiet):
         ends = index_of[pair.name0], index_of[pair.name1]
         matches = read_verified(pair)
-        matches = matches.select(choose_carrying(matches.score, config.carry_score))
+        # Exact seeds are few, and matches of them sure.
+        least_score = 0.0 if photos[ends[0]].seeds_are_exact else config.carry_score
+        matches = matches.select(choose_carrying(matches.score, least_score))
         carriers = make_carriers(matches, *(photos[i].px_per_unit for i in ends))
         turn = strength[ends[1]] > strength[ends[0]]
         first, second = ends[::-1] if turn else ends

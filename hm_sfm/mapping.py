@@ -161,8 +161,8 @@ def map_globally(
     """As map_incrementally, with COLMAP's global mapper: the rotations of all images, then all positions and points.
 
     Focal lengths that nothing is known about are found first, from all pairs together; where that does not lead to a
-    model of all images, COLMAP's guess is tried, too. The database stays as it is. on_image is called when all is done.
-    The global mapper cannot be interrupted.
+    model of all images, the guess of make_cameras is tried, too. The database stays as it is. on_image is called when
+    all is done. The global mapper cannot be interrupted.
 
     It needs matches that are one to one and tracks with one keypoint per image, which IndexMatches and
     persist_keypoints guarantee: it stops at a match that occurs twice, and drops tracks whose observations in one image
@@ -321,7 +321,7 @@ def _run_global_mapper(
 
     best: list[pycolmap.Reconstruction] = []
     # Where all cameras look at one point, two views say nothing about the focal length, and calibration may return
-    # anything: COLMAP's guess, which adjustment refines, is then the better start.
+    # anything: the first guess, which adjustment refines, is then the better start.
     for calibrate in (True, False) if unknown_focal else (False,):
         own_copy = output_folder / "database.db"  # calibration writes to it
         shutil.copy(database_path, own_copy)

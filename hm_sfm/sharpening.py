@@ -29,6 +29,7 @@ from hm_sfm.network.model import (
     HomoMatcher,
     autocast,
     cell_to_px,
+    computes_in_half,
     make_start,
     pad_image,
     round_to_cells,
@@ -39,7 +40,7 @@ from hm_sfm.store import MatchStore
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 from hm_sfm.variants import UPRIGHT, Variant, show_image
 
-STRIP_PX = 512
+STRIP_PX = 1024
 """Large photos are encoded in strips of so many rows, to bound the memory,"""
 MARGIN_PX = 128
 """with so many more on each side as the network looks around. Both are multiples of any backbone's stride."""
@@ -172,8 +173,8 @@ def place_again(
     missing = [pair for pair in placed if pair not in store]
     image_of = {image.name: image for image in images}
     largest = max((math.prod(size_at(image, native_px)) for image in images), default=1)
-    # Of 4-byte features; where the processor computes in half precision they take half of that.
-    bytes_per_px = 4 * matcher.net.backbone.fine_channels / matcher.net.backbone.fine_grid.stride**2
+    bytes_per_number = 2 if computes_in_half(matcher.device) else 4
+    bytes_per_px = bytes_per_number * matcher.net.backbone.fine_channels / matcher.net.backbone.fine_grid.stride**2
     capacity = max(2, int(matcher.config.feature_cache_mb * 1e6 / (largest * bytes_per_px)))
 
     @lru_cache(maxsize=capacity)

@@ -104,7 +104,6 @@ class LightBackbone(nn.Module):
 
     def forward(self, image: Tensor, want_fine: bool = True) -> FeatureMaps:
         """image: (B, 1, H, W) float32 of zero mean and unit variance, H and W multiples of `stride`."""
-        image = image.contiguous(memory_format=torch.channels_last)
         quarter, eighth = self.trunk(image)
         return FeatureMaps(coarse=eighth, fine=self.fine(image, quarter, eighth) if want_fine else None)
 

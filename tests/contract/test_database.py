@@ -78,15 +78,21 @@ def test_jpeg_refuses_what_it_cannot_hold(tmp_path, image, focal_35mm, orientati
 # Cameras
 
 
-@pytest.mark.parametrize("focal_35mm", [28.0, None])
-def test_focal_is_the_one_that_pycolmap_infers(tmp_path, focal_35mm):
-    photo = make_photo(tmp_path, "a.jpg", focal_35mm)
+def test_focal_of_exif_is_the_one_that_pycolmap_infers(tmp_path):
+    photo = make_photo(tmp_path, "a.jpg", 28.0)
     camera = make_cameras([photo], CameraConfig()).cameras[0]
     expected = pycolmap.infer_camera_from_image(photo.path)
     assert camera.model == expected.model
     assert (camera.width, camera.height) == (60, 40)
     np.testing.assert_array_equal(camera.params, expected.params)
-    assert camera.has_prior_focal_length == expected.has_prior_focal_length == (focal_35mm is not None)
+    assert camera.has_prior_focal_length and expected.has_prior_focal_length
+
+
+def test_an_unknown_focal_is_guessed_from_the_longer_side(tmp_path):
+    camera = make_cameras([make_photo(tmp_path, "a.jpg", None)], CameraConfig()).cameras[0]
+    assert (camera.width, camera.height) == (60, 40)
+    np.testing.assert_array_equal(camera.params, [0.9 * 60, 30, 20, 0])
+    assert not camera.has_prior_focal_length
 
 
 def test_auto_shares_one_camera_across_folders_where_all_agree(tmp_path):

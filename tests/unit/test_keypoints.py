@@ -422,8 +422,11 @@ def test_doubtful_patches_carry_nothing_where_there_are_better_ones():
         for field in ("xy0", "xy1", "score", "homography")
     }
     photos = [make_photo("a", (40.0, 30.0)), make_photo("b")]
-    assert not persist(photos, [dataclasses.replace(sure, **joined)])[2]
+    matches = dataclasses.replace(sure, **joined)
+    assert not persist(photos, [matches])[2]
     assert len(persist(photos, [doubtful])[2]) == 1
+    exact = [dataclasses.replace(photo, seeds_are_exact=True) for photo in photos]
+    assert len(persist(exact, [matches])[2]) == 1
 
 
 def test_thinning_keeps_the_best_and_the_distance():

@@ -216,6 +216,13 @@ def test_the_fast_configuration_matches_a_shifted_image():
     assert np.mean(np.linalg.norm(found.xy1 - (found.xy0 - [20, 0]), axis=1)[good] < 1) > 0.9
 
 
+def test_features_lie_channels_last_which_is_twice_as_fast(matcher):
+    with torch.inference_mode():
+        maps = matcher.net.backbone(torch.rand(1, 1, 64, 96))
+    for features in (maps.coarse, maps.fine):
+        assert features.is_contiguous(memory_format=torch.channels_last)
+
+
 def test_matches_come_best_first(matcher):
     found = matcher.match(make_texture(160, 128), make_texture(192, 128)[:, 10:])
     assert len(found) > 20

@@ -134,9 +134,9 @@ class KeypointConfig:
     """Of the joint adjustment of each track's keypoints; 0 leaves them where they were first predicted."""
     max_keypoints: int = 8000
     """Per image, longest tracks first, spread over the image."""
-    native_px: int = 0
-    """Long edge at which a second fine pass places carried keypoints, of photos that are larger than images.long_edge_px
-    (never enlarged); 0: keypoints are as exact as the matching resolution allows."""
+    native_px: int = 1024
+    """Long edge of the photos on which a second fine pass places carried keypoints again, at least images.long_edge_px,
+    never enlarged; 0 leaves it out. Networks without homographies do without it."""
 
 
 @dataclass(frozen=True)

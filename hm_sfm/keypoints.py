@@ -192,14 +192,14 @@ def thin_points(xy: np.ndarray, spacing: float) -> np.ndarray:
     return keep
 
 
-def choose_carrying(score: np.ndarray, least_score: float) -> np.ndarray:
-    """Which of a pair's verified matches carry keypoints, by their scores (N,): (N,) bool.
+def choose_good(score: np.ndarray, least_score: float, at_least: int) -> np.ndarray:
+    """Which of a pair's matches or links to use, by their scores (N,): (N,) bool.
 
-    Those of least_score or more: a track is as exact as its worst observation. Where fewer are, the best CARRYING.
+    Those of least_score or more: a track is as exact as its worst observation. Where fewer are, the best at_least.
     """
-    carrying = score >= least_score
-    carrying[np.argsort(-score, kind="stable")[:CARRYING]] = True
-    return carrying
+    good = score >= least_score
+    good[np.argsort(-score, kind="stable")[:at_least]] = True
+    return good
 
 
 def make_carriers(matches: PairMatches, px_per_unit0: float, px_per_unit1: float) -> tuple[Carrier, Carrier]:
@@ -324,7 +324,7 @@ def link_keypoints(
         matches = read_verified(pair)
         # Exact seeds are few, and matches of them sure.
         least_score = 0.0 if photos[ends[0]].seeds_are_exact else config.carry_score
-        matches = matches.select(choose_carrying(matches.score, least_score))
+        matches = matches.select(choose_good(matches.score, least_score, CARRYING))
         carriers = make_carriers(matches, *(photos[i].px_per_unit for i in ends))
         turn = strength[ends[1]] > strength[ends[0]]
         first, second = ends[::-1] if turn else ends

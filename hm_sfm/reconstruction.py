@@ -329,7 +329,7 @@ def carry_keypoints(
         config.keypoints,
         quiet,
     )
-    if config.keypoints.native_px > config.images.long_edge_px:
+    if config.keypoints.native_px and config.network.head == "homography":
         linked = thin_links(linked, config.keypoints)  # the second pass is worth its time for what is kept only
         linked = sharpen(linked, images, store.store if isinstance(store, MaskedStore) else store, config, quiet)
     return finish_keypoints(linked, config.keypoints)
@@ -339,10 +339,12 @@ def sharpen(
     linked: LinkedKeypoints, images: Sequence[ImageRef], store: MatchStore, config: Config, quiet: bool
 ) -> LinkedKeypoints:
     """sharpen_links with the matcher of the configuration; what is done is kept beside the matches."""
+    # The coarse matches are made already, whoever made them.
+    matching = dataclasses.replace(config.matching, coarse="light", coarse_matches="")
     matcher = HomoMatcher.from_pretrained(
-        config.matching.model, config=config.matching, images=config.images, network=config.network
+        matching.model, config=matching, images=config.images, network=config.network
     )
-    native_px = config.keypoints.native_px
+    native_px = max(config.keypoints.native_px, config.images.long_edge_px)
     made_by = {**store.made_by, "keypoints.native_px": native_px}
     path = store.path.with_name("native.h5")
     return sharpen_links(linked, images, matcher, native_px, path, made_by, store.digests, quiet)

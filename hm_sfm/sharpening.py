@@ -1,15 +1,16 @@
-"""Keypoints at native resolution: a second fine pass over what was carried, on the features of larger photos.
+"""Keypoints placed a second time: a fine pass over what was carried, each keypoint in the middle of a patch of its own.
 
-Photos are matched at images.long_edge_px. Where they are larger, each carried keypoint is placed again by a patch of the
-larger photo, around the keypoint itself, starting from what the first homographies say: as exact as matching at that
-size, without its cost.
+Patches carry the keypoints around their centres. What was carried is placed again by a patch around the keypoint itself,
+starting from what the first homographies say, which is more exact; links that this does not confirm are given up. The
+second pass looks at photos of keypoints.native_px, which may be larger than those that were matched: it is as exact as
+matching at that size, without its cost.
 """
 
 import dataclasses
 import hashlib
 import math
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +23,7 @@ from tqdm import tqdm
 from hm_sfm.batches import store_in_batches
 from hm_sfm.errors import ConfigError, StaleResultError
 from hm_sfm.images import PreparedImage, prepare_image
-from hm_sfm.keypoints import LinkedKeypoints, Links, Photo, differentiate
+from hm_sfm.keypoints import LinkedKeypoints, Links, Photo, choose_good, differentiate
 from hm_sfm.network.fine import FineMap, HomographyHead, make_fine_map
 from hm_sfm.network.homography import is_regular
 from hm_sfm.network.model import (
@@ -44,10 +45,16 @@ STRIP_PX = 1024
 """Large photos are encoded in strips of so many rows, to bound the memory,"""
 MARGIN_PX = 128
 """with so many more on each side as the network looks around. Both are multiples of any backbone's stride."""
-FARTHEST = 1.0
-"""Px of the matching resolution by which the second pass may move a prediction: farther, it has lost its way."""
+ITERATIONS = 1
+"""Updates of the homographies, which start near the truth: a second one changes nothing that can be measured."""
+FARTHEST = 0.7
+"""Px of the matching resolution by which the second pass may move a prediction: farther, one of the two is wrong."""
 LEAST_SCORE = 0.1
 """Predictions of a lower score stay as the first pass made them."""
+CONFIRMING_SCORE = 0.7
+"""Links of a lower score, or moved too far, are given up"""
+LEAST_LINKS = 300
+"""where their pair has so many better ones."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +102,9 @@ def sharpen_links(
     images: the photos of `linked`, in its order. store_path: keeps what is done, pair by pair; an interrupted run goes
     on from there. made_by, digests: the settings and the photos that the links depend on, see MatchStore.
 
-    Links that the second pass does not confirm stay as they are, and count less. Raises ConfigError where the network
-    has no homography head, and what MatchStore.write and prepare_image raise.
+    Links that the second pass does not confirm are given up, but for the best ones of pairs that have few; these stay as
+    they are, and count less. Raises ConfigError where the network has no homography head, and what MatchStore.write and
+    prepare_image raise.
     """
     if not isinstance(matcher.net.head, HomographyHead):
         raise ConfigError("keypoints.native_px needs network.head homography, found expectation")
@@ -104,20 +112,27 @@ def sharpen_links(
     for at, links in enumerate(linked.links):
         names = sorted(linked.photos[i].name for i in (links.source_image, links.target_image))
         members.setdefault(ImagePair(*names), []).append(at)
-    placed = {pair: place_links(linked, pair, numbers) for pair, numbers in members.items()}
-    store = open_native_store(store_path, placed, made_by, digests)
-    place_again(placed, images, matcher, store, native_px, quiet)
+
+    def place(pair: ImagePair) -> Placement:
+        return place_links(linked, pair, members[pair])
+
+    store = open_native_store(store_path, map(place, members), made_by, digests)
+    place_again(tuple(members), place, images, matcher, store, native_px, quiet)
 
     native = tuple(refine_units(photo, image, native_px) for photo, image in zip(linked.photos, images, strict=True))
     sharpened = list(linked.links)
     for pair, numbers in members.items():
-        found, first = store.read(pair), 0
+        placement, found, first, updated = place(pair), store.read(pair), 0, []
         for at in numbers:
             links = linked.links[at]
             these = slice(first, first + len(links.source))
             onward = linked.photos[links.source_image].name == pair.name0
-            sharpened[at] = update_links(links, native, onward, placed[pair].select(these), found.select(these))
+            updated.append(update_links(links, native, onward, placement.select(these), found.select(these)))
             first = these.stop
+        kept = choose_good(np.concatenate([sure for _, sure in updated]), CONFIRMING_SCORE, LEAST_LINKS)
+        ends = np.cumsum([len(sure) for _, sure in updated])[:-1]
+        for at, (links, _), of_links in zip(numbers, updated, np.split(kept, ends)):
+            sharpened[at] = links.select(of_links)
     xy = tuple(xy * photo.finer for xy, photo in zip(linked.xy, native))
     return LinkedKeypoints(native, xy, tuple(sharpened))
 
@@ -145,11 +160,11 @@ def place_links(linked: LinkedKeypoints, pair: ImagePair, members: Sequence[int]
 
 
 def open_native_store(
-    path: Path, placed: Mapping[ImagePair, Placement], made_by: Mapping[str, Any], digests: Mapping[str, str]
+    path: Path, placed: Iterable[Placement], made_by: Mapping[str, Any], digests: Mapping[str, str]
 ) -> MatchStore:
     """What an earlier run has done of exactly these links; where it did others, they are removed."""
     digest = hashlib.sha256()
-    for placement in placed.values():
+    for placement in placed:
         for array in (placement.xy0, placement.xy1, placement.linear):
             digest.update(np.ascontiguousarray(array).tobytes())
     made_by = {**made_by, "links": digest.hexdigest()[:16]}
@@ -162,15 +177,16 @@ def open_native_store(
 
 
 def place_again(
-    placed: Mapping[ImagePair, Placement],
+    pairs: Sequence[ImagePair],
+    place: Callable[[ImagePair], Placement],
     images: Sequence[ImageRef],
     matcher: HomoMatcher,
     store: MatchStore,
     native_px: int,
     quiet: bool,
 ) -> None:
-    """Store what the second pass says of the pairs that the store lacks."""
-    missing = [pair for pair in placed if pair not in store]
+    """Store what the second pass says of the pairs that the store lacks. place: where the first one put their links."""
+    missing = [pair for pair in pairs if pair not in store]
     image_of = {image.name: image for image in images}
     largest = max((math.prod(size_at(image, native_px)) for image in images), default=1)
     bytes_per_number = 2 if computes_in_half(matcher.device) else 4
@@ -182,8 +198,8 @@ def place_again(
         return encode_native(matcher, prepare_image(image_of[name], native_px), variant)
 
     with store_in_batches(store.write) as keep:
-        for pair in tqdm(order_pairs(missing, capacity), desc="native", unit="pair", disable=quiet or not missing):
-            names, placement = (pair.name0, pair.name1), placed[pair]
+        for pair in tqdm(order_pairs(missing, capacity), desc="second pass", unit="pair", disable=quiet or not missing):
+            names, placement = (pair.name0, pair.name1), place(pair)
             variants = fit_variants(relate_inputs(*(encode(name, UPRIGHT) for name in names), placement))
             keep([place_pair(matcher, *map(encode, names, variants), pair, placement)])
     store.merge()
@@ -247,7 +263,7 @@ def place_pair(
     cell1, rest1 = round_to_cells(xy1, grid)
     start = make_start(rest0, rest1, linear, head.half).to(matcher.device)
     cells = cell0.to(matcher.device), cell1.to(matcher.device)
-    homography, log_scale = matcher.estimate_patches(features0.fine, features1.fine, *cells, start)
+    homography, log_scale = matcher.estimate_patches(features0.fine, features1.fine, *cells, start, ITERATIONS)
     regular = is_regular(homography, head.half).cpu().numpy()
 
     stored0 = features0.stored_from_scaled @ cell_to_px(cell0.numpy(), grid)
@@ -271,10 +287,12 @@ def place_pair(
 
 def update_links(
     links: Links, native: Sequence[Photo], onward: bool, placement: Placement, found: PairMatches
-) -> Links:
+) -> tuple[Links, np.ndarray]:
     """Links in px of the native resolution, as the second pass predicts them where it is of use.
 
-    onward: they lead from the first photo of the pair to the second; placement, found: of these links.
+    onward: they lead from the first photo of the pair to the second; placement, found: of these links. Also returns how
+    sure the second pass is of each, (E,): the probability that it is off by less than 1 px of the matching resolution, 0
+    where it moved the link too far.
     """
     source, target = native[links.source_image], native[links.target_image]
     inverse = np.linalg.inv(differentiate(found.homography.astype(np.float64), placement.xy0))
@@ -289,15 +307,15 @@ def update_links(
     first = links.carried
     kept = first.predicted * target.finer
     moved = np.linalg.norm(predicted - kept, axis=1)
-    useful = (found.score >= LEAST_SCORE) & (moved <= FARTHEST * target.finer)
+    near = moved <= FARTHEST * target.finer
+    useful = near & (found.score >= LEAST_SCORE)
     # The first pass speaks of 1 px of the matching resolution: the same error scale, in finer px.
     dulled = 1 - (1 - first.score) ** (1 / target.finer)
-    return dataclasses.replace(
-        links,
-        carried=dataclasses.replace(
-            first,
-            predicted=np.where(useful[:, None], predicted, kept),
-            jacobian=np.where(useful[:, None, None], jacobian, first.jacobian * (target.finer / source.finer)),
-            score=np.where(useful, found.score, dulled),
-        ),
+    carried = dataclasses.replace(
+        first,
+        predicted=np.where(useful[:, None], predicted, kept),
+        jacobian=np.where(useful[:, None, None], jacobian, first.jacobian * (target.finer / source.finer)),
+        score=np.where(useful, found.score, dulled),
     )
+    sure = np.where(near, 1 - (1 - found.score.astype(np.float64)) ** target.finer, 0.0)
+    return dataclasses.replace(links, carried=carried), sure

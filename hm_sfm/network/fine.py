@@ -183,20 +183,22 @@ class HomographyHead(nn.Module):
         cell0: Tensor,
         cell1: Tensor,
         start: Tensor | None = None,
+        iterations: int | None = None,
     ) -> list[FineEstimate]:
         """Homographies from the patch around cell0 of fine0 to the patch around cell1 of fine1.
 
         image_index: (P,) int64, into both batches; cell0, cell1: (P, 2) int64, cells of the 1/2 grid; start: (P, 4, 2)
-        float32 cells, displacements of the corners to start from, None for the paper's identity. Returns the
-        FineEstimate of each iteration.
+        float32 cells, displacements of the corners to start from, None for the paper's identity; iterations: None for
+        the network's own. Returns the FineEstimate of each iteration.
         """
         patch0 = gather_patches(fine0, image_index, cell0, self.side, self.spacing)
         # A last cell of zero features makes the zero that sample_windows takes outside the maps.
         patch1 = gather_patches(fine1, image_index, cell1, self.window + 2 * self.margin, add_zero=True)
         full = correlate_patches(patch0, patch1)
-        pooled = full @ self.pooling.to(full.dtype) if self.iterations > 1 or start is not None else None
+        iterations = iterations or self.iterations
+        pooled = full @ self.pooling.to(full.dtype) if iterations > 1 or start is not None else None
         displacement, estimates = start, []
-        for _ in range(self.iterations):
+        for _ in range(iterations):
             if displacement is None:
                 displacement = full.new_zeros((len(cell0), 4, 2), dtype=torch.float32)
                 target = self.grid.expand(len(cell0), -1, -1)

@@ -250,11 +250,12 @@ class HomoMatcher:
         return self._to_stored(features0, features1, cell0, rest0, cell1, homography, log_scale, regular)
 
     def estimate_patches(
-        self, fine0: FineMap, fine1: FineMap, cell0: Tensor, cell1: Tensor, start: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+        self, fine0: FineMap, fine1: FineMap, cell0: Tensor, cell1: Tensor, start: Tensor | None,
+        iterations: int | None = None,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         """The head's last word on P patches, some at a time: homographies (P, 3, 3) and logs of error scales (P,).
 
-        cell0, cell1: (P, 2) int64 fine cells; start: (P, 4, 2) cells, as in HomographyHead.forward.
+        cell0, cell1: (P, 2) int64 fine cells; start: (P, 4, 2) cells and iterations, as in HomographyHead.forward.
         """
         homography, log_scale = [torch.zeros(0, 3, 3, device=self.device)], [torch.zeros(0, device=self.device)]
         for first in range(0, len(cell0), FINE_CHUNK):
@@ -263,7 +264,7 @@ class HomoMatcher:
             padding = (0, 0, 0, -count % FINE_STEP)
             image = torch.zeros(count + padding[-1], dtype=torch.int64, device=self.device)
             cells = (F.pad(cell[chunk], padding) for cell in (cell0, cell1))
-            begin = {} if start is None else {"start": F.pad(start[chunk], (0, 0, *padding))}
+            begin = {} if start is None else {"start": F.pad(start[chunk], (0, 0, *padding)), "iterations": iterations}
             with autocast(self.device):
                 estimate = self.net.head(fine0, fine1, image, *cells, **begin)[-1]
             homography.append(estimate.homography[:count])

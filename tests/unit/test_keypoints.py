@@ -11,7 +11,7 @@ from hm_sfm.images import prepare_array
 from hm_sfm.keypoints import (
     CARRYING,
     Photo,
-    choose_carrying,
+    choose_good,
     differentiate,
     find_anchors,
     find_seeds,
@@ -403,12 +403,12 @@ def test_ranks_start_anew_in_every_group():
 
 def test_good_matches_carry_and_of_few_good_ones_the_best():
     rng = np.random.default_rng(0)
-    many_good = rng.permutation(np.linspace(0.5, 1.0, 4 * CARRYING))
-    assert np.array_equal(choose_carrying(many_good, 0.7), many_good >= 0.7)
-    few_good = rng.permutation(np.linspace(0.5, 0.75, 4 * CARRYING))
-    assert sorted(few_good[choose_carrying(few_good, 0.7)]) == sorted(few_good)[-CARRYING:]
-    assert choose_carrying(few_good[:7], 0.7).all()
-    assert choose_carrying(np.zeros(0), 0.7).shape == (0,)
+    many_good = rng.permutation(np.linspace(0.5, 1.0, 400))
+    assert np.array_equal(choose_good(many_good, 0.7, 100), many_good >= 0.7)
+    few_good = rng.permutation(np.linspace(0.5, 0.75, 400))
+    assert sorted(few_good[choose_good(few_good, 0.7, 100)]) == sorted(few_good)[-100:]
+    assert choose_good(few_good[:7], 0.7, 100).all()
+    assert choose_good(np.zeros(0), 0.7, 100).shape == (0,)
 
 
 def test_doubtful_patches_carry_nothing_where_there_are_better_ones():

@@ -22,7 +22,7 @@ SIZE_WH = (768, 576)
 UNIT = 3.0
 """Px of the photos per px of the matching resolution."""
 B_FROM_A = np.array([[1.02, -0.06, 14.0], [0.05, 0.99, -9.0], [2e-5, 1e-5, 1.0]])
-NOISE_PX = 1.0
+NOISE_PX = 0.7
 
 
 def true_xy(homography: np.ndarray, xy: np.ndarray) -> np.ndarray:
@@ -81,32 +81,38 @@ def sharpen(linked, photos, matcher, folder, made_by=None, native_px: int = SIZE
 
 
 def measure_errors(linked: LinkedKeypoints) -> np.ndarray:
-    """How far predictions are off, px of the photos."""
-    errors = []
+    """How far the predictions of the keypoints are off, px of the photos; NaN where a link was given up."""
+    errors = np.full(len(linked.xy[0]), np.nan)
     for links, homography in zip(linked.links, (B_FROM_A, np.linalg.inv(B_FROM_A))):
         source, target = linked.photos[links.source_image], linked.photos[links.target_image]
         truth = true_xy(homography, linked.xy[links.source_image][links.source] * source.px_per_unit)
-        errors.append(np.linalg.norm(links.carried.predicted * target.px_per_unit - truth, axis=1))
-    return np.concatenate(errors)
+        errors[links.source] = np.linalg.norm(links.carried.predicted * target.px_per_unit - truth, axis=1)
+    return errors
 
 
-@pytest.fixture(scope="module")
-def sharpened(photos, matcher, tmp_path_factory) -> LinkedKeypoints:
-    return sharpen(link_photos(photos, wrong=20), photos, matcher, tmp_path_factory.mktemp("out"))
+@pytest.fixture
+def many(monkeypatch):
+    """A pair has enough links."""
+    monkeypatch.setattr(sharpening, "LEAST_LINKS", 60)
+
+
+@pytest.fixture
+def sharpened(photos, matcher, tmp_path, many) -> LinkedKeypoints:
+    return sharpen(link_photos(photos, wrong=20), photos, matcher, tmp_path)
 
 
 def test_predictions_get_sharper_in_both_directions(photos, sharpened):
     before, after = measure_errors(link_photos(photos, wrong=20))[20:], measure_errors(sharpened)[20:]
     half = len(before) // 2
     for part in (slice(0, half), slice(half, None)):
-        assert np.median(after[part]) < 0.25 * np.median(before[part])
+        assert np.nanmedian(after[part]) < 0.25 * np.median(before[part])
         assert np.mean(after[part] < 0.5) > 0.9
 
 
 def test_jacobians_follow_the_plane(sharpened):
     links = sharpened.links[0]
     truth = differentiate(np.tile(B_FROM_A, (len(links.source), 1, 1)), sharpened.xy[0][links.source])
-    assert np.median(abs(links.carried.jacobian - truth)[20:]) < 0.02
+    assert np.median(abs(links.carried.jacobian - truth)) < 0.02
 
 
 def test_units_are_those_of_the_photos(photos, sharpened):
@@ -114,11 +120,21 @@ def test_units_are_those_of_the_photos(photos, sharpened):
     np.testing.assert_allclose(sharpened.xy[0], link_photos(photos, wrong=20).xy[0] * UNIT)
 
 
-def test_wrong_predictions_stay_and_count_less(photos, sharpened):
-    before, links = link_photos(photos, wrong=20).links[0].carried, sharpened.links[0].carried
-    np.testing.assert_allclose(links.predicted[:20], before.predicted[:20] * UNIT)
-    assert (links.score[:20] < 0.5 * before.score[:20]).all()
-    assert np.median(links.score[20:]) > 0.5
+def test_wrong_predictions_are_given_up(sharpened):
+    given_up = np.isnan(measure_errors(sharpened))
+    assert given_up[:20].all() and given_up[20:].mean() < 0.1
+    assert np.median(sharpened.links[0].carried.score) > 0.5
+
+
+def test_where_few_are_right_the_best_stay_and_wrong_ones_count_less(photos, matcher, tmp_path, many):
+    linked = link_photos(photos, wrong=20)
+    first = linked.links[0]
+    linked = dataclasses.replace(linked, links=(first.select(first.source < 60),))
+    before, after = first.carried, sharpen(linked, photos, matcher, tmp_path).links[0].carried
+    np.testing.assert_array_equal(after.point, np.arange(60))
+    np.testing.assert_allclose(after.predicted[:20], before.predicted[:20] * UNIT)
+    assert (after.score[:20] < 0.5 * before.score[:20]).all()
+    assert np.median(after.score[20:]) > 0.5
 
 
 def test_the_keypoints_of_tracks_end_where_they_should(photos, sharpened):
@@ -129,7 +145,7 @@ def test_the_keypoints_of_tracks_end_where_they_should(photos, sharpened):
     assert [found.name for found in keypoints] == [photo.name for photo in photos]
 
 
-def test_photos_of_the_matching_resolution_keep_their_units(photos, matcher, tmp_path):
+def test_photos_of_the_matching_resolution_keep_their_units(photos, matcher, tmp_path, many):
     linked = link_photos(photos)
     small = tuple(dataclasses.replace(photo, px_per_unit=1.0) for photo in linked.photos)
     xy = tuple(xy * UNIT for xy in linked.xy)
@@ -140,10 +156,9 @@ def test_photos_of_the_matching_resolution_keep_their_units(photos, matcher, tmp
     result = sharpen(LinkedKeypoints(small, xy, links), photos, matcher, tmp_path)
     assert [photo.finer for photo in result.photos] == [1.0, 1.0]
     before, after = measure_errors(linked), measure_errors(result)
-    near = before < 0.8
-    assert np.median(after[near]) < 0.5 * np.median(before[near])
-    for before, after in zip(links, result.links):
-        assert np.linalg.norm(before.carried.predicted - after.carried.predicted, axis=1).max() <= 1.0
+    near = before < 0.6
+    assert np.nanmedian(after[near]) < 0.5 * np.median(before[near])
+    assert np.isnan(after[before > 1.2]).all()
 
 
 def test_what_was_done_is_not_done_again_and_other_links_are(photos, matcher, tmp_path, monkeypatch):
@@ -198,7 +213,7 @@ def test_a_photo_on_its_side_and_twice_as_large_gets_sharper_too(photos, matcher
     carried = dataclasses.replace(links.carried, predicted=off / UNIT, jacobian=jacobian)
     linked = dataclasses.replace(linked, links=(dataclasses.replace(links, carried=carried),))
     after = sharpen(linked, turned, matcher, tmp_path, native_px=2 * SIZE_WH[0]).links[0].carried
-    errors = np.linalg.norm(after.predicted - truth, axis=1)
+    errors = np.linalg.norm(after.predicted - truth[after.point], axis=1)
     assert np.median(errors) < 0.3 * np.median(np.linalg.norm(off - truth, axis=1))
     assert np.median(after.score) > 0.3
 

@@ -340,7 +340,7 @@ def sharpen(
 ) -> LinkedKeypoints:
     """sharpen_links with the matcher of the configuration; what is done is kept beside the matches."""
     # The coarse matches are made already, whoever made them.
-    matching = dataclasses.replace(config.matching, coarse="light", coarse_matches="")
+    matching = dataclasses.replace(config.matching, coarse="light", coarse_matches="", coarse_features="")
     matcher = HomoMatcher.from_pretrained(matching.model, config=matching, images=config.images, network=config.network)
     native_px = max(config.keypoints.native_px, config.images.long_edge_px)
     made_by = {**store.made_by, "keypoints.native_px": native_px}

@@ -1,6 +1,7 @@
 """--coarse and --coarse-matches, as a user types them."""
 
 import h5py
+import pycolmap
 
 from hm_sfm.coordinates import pixel_index_from_px
 
@@ -35,6 +36,18 @@ def test_a_run_starts_from_sift(scene, tmp_path, run):
     assert run(*command, "--pairs", pairs, *options).code == 0
     with h5py.File(tmp_path / "other" / "matches.h5") as h5:
         assert abs(len(h5["000000/score"]) - len(score)) < 10
+
+
+def test_keypoints_are_placed_again_whoever_made_the_matches(scene, reconstructed, tmp_path, run):
+    for name in (".hm_sfm", "matches.h5"):
+        (tmp_path / name).write_bytes((reconstructed / name).read_bytes())
+    assert run("export", scene.images, tmp_path, "--format", "hloc", "--quiet").code == 0
+    hloc = tmp_path / "hloc"
+    options = ("--coarse-matches", hloc / "matches.h5", "--coarse-features", hloc / "features.h5", "--quiet")
+    finished = run("export", scene.images, tmp_path / "out", *options)
+    assert (finished.code, finished.err) == (0, "")
+    with pycolmap.Database.open(tmp_path / "out" / "database.db") as database:
+        assert database.num_inlier_matches() > 1000
 
 
 def test_an_unknown_name_is_refused_before_anything_is_done(scene, tmp_path, run):

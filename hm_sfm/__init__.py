@@ -5,7 +5,7 @@ from typing import Any
 
 _MODULE_OF = {
     "Config": "config",
-    "HomoMatcher": "network.model",
+    "HomoMatcher": "matching.matcher",
     "ImagePair": "types",
     "IndexMatches": "types",
     "Keypoints": "types",
@@ -13,10 +13,10 @@ _MODULE_OF = {
     "PairMatches": "types",
     "PatchMatches": "types",
     "Tracks": "types",
-    "export_database": "reconstruction",
+    "export_database": "pipeline.reconstruction",
     "load_config": "config",
-    "match_photos": "reconstruction",
-    "reconstruct": "reconstruction",
+    "match_photos": "pipeline.reconstruction",
+    "reconstruct": "pipeline.reconstruction",
 }
 
 __all__ = list(_MODULE_OF)

@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NoReturn
 
-from hm_sfm.atomic import replace_file
+from hm_sfm.io.atomic import replace_file
 from hm_sfm.config import Config, load_config
 from hm_sfm.errors import HmSfmError, InputError, NoModelError
 
@@ -285,8 +285,8 @@ def read_config(options: argparse.Namespace) -> Config:
 
 
 def run_match(options: argparse.Namespace) -> int:
-    from hm_sfm.reconstruction import match_photos
-    from hm_sfm.shards import Shard
+    from hm_sfm.pipeline.reconstruction import match_photos
+    from hm_sfm.matching.shards import Shard
 
     shard = None if options.shard is None else Shard.parse(options.shard)
     matched = match_photos(options.images, options.out, read_config(options), options.quiet, shard)
@@ -296,7 +296,7 @@ def run_match(options: argparse.Namespace) -> int:
 
 
 def run_merge(options: argparse.Namespace) -> int:
-    from hm_sfm.reconstruction import merge_matches
+    from hm_sfm.pipeline.reconstruction import merge_matches
 
     count = merge_matches(options.images, options.out, read_config(options))
     print(f"{count} pairs: {options.out / 'matches.h5'}")
@@ -304,7 +304,7 @@ def run_merge(options: argparse.Namespace) -> int:
 
 
 def run_export(options: argparse.Namespace) -> int:
-    from hm_sfm.reconstruction import export_database, export_hloc
+    from hm_sfm.pipeline.reconstruction import export_database, export_hloc
 
     if options.format == "hloc":
         matched = export_hloc(options.images, options.out, read_config(options), options.quiet)
@@ -317,8 +317,8 @@ def run_export(options: argparse.Namespace) -> int:
 
 
 def run_compare(options: argparse.Namespace) -> int:
-    from hm_sfm.comparison import compare
-    from hm_sfm.report import format_table, plot_tracks, require_plots, write_json
+    from hm_sfm.evaluation.comparison import compare
+    from hm_sfm.evaluation.comparison_report import format_table, plot_tracks, require_plots, write_json
 
     if (options.hloc_features is None) != (options.hloc_matches is None):
         raise InputError("--hloc-features and --hloc-matches need each other: hloc keeps one run in two files")
@@ -346,7 +346,7 @@ def run_compare(options: argparse.Namespace) -> int:
 
 
 def run_reconstruct(options: argparse.Namespace) -> int:
-    from hm_sfm.reconstruction import reconstruct
+    from hm_sfm.pipeline.reconstruction import reconstruct
 
     reconstruct(options.images, options.out, read_config(options), options.quiet)
     print_summary(options.out)
@@ -354,7 +354,7 @@ def run_reconstruct(options: argparse.Namespace) -> int:
 
 
 def run_refine(options: argparse.Namespace) -> int:
-    from hm_sfm.refinement import refine_database
+    from hm_sfm.pipeline.refine_database import refine_database
 
     config = read_config(options)
     matched, database = refine_database(options.database, options.images, options.out, config, options.quiet)
@@ -363,7 +363,7 @@ def run_refine(options: argparse.Namespace) -> int:
 
 
 def run_convert(options: argparse.Namespace) -> int:
-    from hm_sfm.conversion import convert_run
+    from hm_sfm.export.conversion import convert_run
 
     convert_run(options.out, options.to, options.target, options.images)
     print(f"{options.to}: {options.target}")
@@ -371,7 +371,7 @@ def run_convert(options: argparse.Namespace) -> int:
 
 
 def run_frames(options: argparse.Namespace) -> int:
-    from hm_sfm.frames import extract_frames
+    from hm_sfm.photos.videos import extract_frames
 
     frames = extract_frames(options.videos, options.images, options.every, options.format, options.quiet)
     print(f"{len(frames)} frames of {len(options.videos)} videos: {options.images}")
@@ -379,9 +379,9 @@ def run_frames(options: argparse.Namespace) -> int:
 
 
 def run_demo(options: argparse.Namespace) -> int:
-    from hm_sfm.demo import write_demo
-    from hm_sfm.evaluation import read_strecha_cameras, score_model
-    from hm_sfm.reconstruction import claim_folder, reconstruct
+    from hm_sfm.synthetic.demo import write_demo
+    from hm_sfm.evaluation.poses import read_strecha_cameras, score_model
+    from hm_sfm.pipeline.reconstruction import claim_folder, reconstruct
 
     claim_folder(options.out)
     write_demo(options.out)
@@ -396,8 +396,8 @@ def run_demo(options: argparse.Namespace) -> int:
 
 
 def run_show(options: argparse.Namespace) -> int:
-    from hm_sfm.network.model import HomoMatcher
-    from hm_sfm.pair_picture import check_picture_path, draw_pair, write_picture
+    from hm_sfm.matching.matcher import HomoMatcher
+    from hm_sfm.report.pair_picture import check_picture_path, draw_pair, write_picture
 
     check_picture_path(options.picture)
     config = read_config(options)
@@ -415,10 +415,10 @@ def run_show(options: argparse.Namespace) -> int:
 
 
 def run_evaluate(options: argparse.Namespace) -> int:
-    from hm_sfm.match_pictures import MatchPictures
-    from hm_sfm.network.model import HomoMatcher
-    from hm_sfm.pair_evaluation import read_strecha_pairs, read_superglue_pairs, score_homographies, score_poses
-    from hm_sfm.point_evaluation import score_points
+    from hm_sfm.report.drawn_matches import MatchPictures
+    from hm_sfm.matching.matcher import HomoMatcher
+    from hm_sfm.evaluation.relative_poses import read_strecha_pairs, read_superglue_pairs, score_homographies, score_poses
+    from hm_sfm.evaluation.points import score_points
     from hm_sfm.training.photos import load_photos
     from hm_sfm.training.validation import make_validation_pairs
 

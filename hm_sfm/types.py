@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from hm_sfm.neighbours import find_nearest
+from hm_sfm.geometry.nearest import find_nearest
 
 
 def freeze_array(value: Any, dtype: type, shape: tuple[int | None, ...], what: str) -> np.ndarray:

@@ -13,12 +13,12 @@ import torch
 from tables import write_json
 from torch import Tensor
 
-from hm_sfm.atomic import replace_file
+from hm_sfm.io.atomic import replace_file
 from hm_sfm.config import ImageConfig, MatchingConfig, fingerprint
-from hm_sfm.images import prepare_image, read_ref
+from hm_sfm.photos.images import prepare_image, read_ref
 from hm_sfm.network.fine import make_fine_map
-from hm_sfm.network.model import FINE_CHUNK, HomoMatcher, HomoNet, autocast, pad_image, read_checkpoint
-from hm_sfm.pair_evaluation import PosePair, read_strecha_pairs, score_poses
+from hm_sfm.matching.matcher import FINE_CHUNK, HomoMatcher, HomoNet, autocast, pad_image, read_checkpoint
+from hm_sfm.evaluation.relative_poses import PosePair, read_strecha_pairs, score_poses
 from hm_sfm.training.loop import TrainConfig, run_fingerprint
 from hm_sfm.training.losses import DENSE_RADIUS
 from hm_sfm.training.mixture import MixedPairs, collate_pairs

@@ -17,7 +17,7 @@ from tables import format_table, write_json
 
 from hm_sfm.config import Config, load_config
 from hm_sfm.errors import HmSfmError
-from hm_sfm.pair_evaluation import PosePair, read_strecha_pairs, score_pose_matches
+from hm_sfm.evaluation.relative_poses import PosePair, read_strecha_pairs, score_pose_matches
 
 METHODS = {
     "hm_sfm": HmSfm,

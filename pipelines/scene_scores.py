@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from hm_sfm.database import open_database
-from hm_sfm.evaluation import measure_angle_deg, measure_rotation_deg, relative_pose
-from hm_sfm.pair_evaluation import PointMatches, estimate_pose_colmap
+from hm_sfm.colmap.database import open_database
+from hm_sfm.evaluation.poses import measure_angle_deg, measure_rotation_deg, relative_pose
+from hm_sfm.evaluation.relative_poses import PointMatches, estimate_pose_colmap
 
 ROTATION_DEG, DIRECTION_DEG = 5.0, 10.0
 """A verified pair is correct where rotation and direction of translation are off by no more."""

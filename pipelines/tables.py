@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from hm_sfm.atomic import replace_file
+from hm_sfm.io.atomic import replace_file
 
 TEXT_COLUMNS = 2
 """The first columns of a table, scene and method, are words."""

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from hm_sfm.coordinates import Grid
+from hm_sfm.geometry.frames import Grid
 from hm_sfm.errors import WeightsError
 
 

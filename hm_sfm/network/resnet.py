@@ -3,7 +3,7 @@
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from hm_sfm.coordinates import Grid
+from hm_sfm.geometry.frames import Grid
 from hm_sfm.network.backbone import FeatureMaps
 
 WIDTHS = (128, 196, 256)

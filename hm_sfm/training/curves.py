@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hm_sfm.atomic import replace_file
+from hm_sfm.io.atomic import replace_file
 from hm_sfm.errors import MissingPackageError
 
 SMOOTHED_SHARE = 0.02

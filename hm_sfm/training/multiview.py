@@ -15,8 +15,8 @@ import numpy as np
 import pycolmap
 from torch.utils.data import Dataset
 
-from hm_sfm.atomic import replace_file
-from hm_sfm.coordinates import homography_to_pixel_index
+from hm_sfm.io.atomic import replace_file
+from hm_sfm.geometry.frames import homography_to_pixel_index
 from hm_sfm.errors import InputError
 from hm_sfm.training.photos import POINTS, SURFACES, disturb_view, render_view
 

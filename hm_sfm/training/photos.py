@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from torch.utils.data import Dataset
 
-from hm_sfm.coordinates import homography_to_pixel_index
+from hm_sfm.geometry.frames import homography_to_pixel_index
 from hm_sfm.errors import InputError
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}

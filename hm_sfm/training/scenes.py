@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from torch.utils.data import Dataset
 
-from hm_sfm.coordinates import homography_to_pixel_index
-from hm_sfm.rendering import NEAR_M, find_box, frame_in_camera, uvw_from_px
+from hm_sfm.geometry.frames import homography_to_pixel_index
+from hm_sfm.synthetic.rendering import NEAR_M, find_box, frame_in_camera, uvw_from_px
 from hm_sfm.training.photos import POINTS, SURFACES, disturb_view
 from hm_sfm.types import PinholeView
 

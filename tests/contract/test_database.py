@@ -1,4 +1,4 @@
-"""What hm_sfm.database promises to COLMAP, and hm_sfm.exif to hm_sfm.database."""
+"""What hm_sfm.colmap.database promises to COLMAP, and hm_sfm.photos.exif to hm_sfm.colmap.database."""
 
 from pathlib import Path
 
@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 
 from hm_sfm.config import CameraConfig
-from hm_sfm.database import Cameras, make_cameras, open_database, write_database
+from hm_sfm.colmap.database import Cameras, make_cameras, open_database, write_database
 from hm_sfm.errors import ConfigError, InputError
-from hm_sfm.exif import write_jpeg
-from hm_sfm.images import list_images
+from hm_sfm.photos.exif import write_jpeg
+from hm_sfm.photos.images import list_images
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 

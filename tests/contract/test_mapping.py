@@ -1,4 +1,4 @@
-"""What hm_sfm.mapping makes of oracle scenes: cameras, points and keypoints known, matches exact or planted wrong."""
+"""What hm_sfm.colmap.mapping makes of oracle scenes: cameras, points and keypoints known, matches exact or planted wrong."""
 
 import shutil
 import signal
@@ -11,15 +11,15 @@ import numpy as np
 import pycolmap
 import pytest
 
-import hm_sfm.mapping
+import hm_sfm.colmap.mapping
 from hm_sfm.config import MappingConfig, VerificationConfig
-from hm_sfm.database import Cameras, open_database, write_database
+from hm_sfm.colmap.database import Cameras, open_database, write_database
 from hm_sfm.errors import ConfigError, InputError
-from hm_sfm.hloc import read_features, read_matches, write_features, write_matches
-from hm_sfm.mapping import choose_mapper, map_globally, map_images, map_incrementally, summarise_models
-from hm_sfm.snapshots import digest_inputs
+from hm_sfm.formats.hloc import read_features, read_matches, write_features, write_matches
+from hm_sfm.colmap.mapping import choose_mapper, map_globally, map_images, map_incrementally, summarise_models
+from hm_sfm.colmap.snapshots import digest_inputs
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, PairMatches
-from hm_sfm.verification import is_convincing, verify_database, verify_pair, verify_pairs
+from hm_sfm.colmap.verification import is_convincing, verify_database, verify_pair, verify_pairs
 
 
 @dataclass(frozen=True)
@@ -209,10 +209,10 @@ def test_missing_database_is_an_input_error(tmp_path):
 KILLED_MAPPING = """
 import os, signal, sys
 from pathlib import Path
-import hm_sfm.mapping
+import hm_sfm.colmap.mapping
 from hm_sfm.config import MappingConfig
 
-hm_sfm.mapping.SNAPSHOT_IMAGES = 3
+hm_sfm.colmap.mapping.SNAPSHOT_IMAGES = 3
 registered = []
 
 def kill_at_nine():
@@ -221,7 +221,7 @@ def kill_at_nine():
         os.kill(os.getpid(), signal.SIGKILL)
 
 folder = Path(sys.argv[1])
-hm_sfm.mapping.map_incrementally(folder / "database.db", folder, folder / "sparse", MappingConfig(), True, kill_at_nine)
+hm_sfm.colmap.mapping.map_incrementally(folder / "database.db", folder, folder / "sparse", MappingConfig(), True, kill_at_nine)
 """
 
 
@@ -230,9 +230,9 @@ def inputs_of_mapper(monkeypatch) -> list[Path | str]:
     """Grows by what each call of the mapper goes on from; snapshots are made often."""
     calls: list[Path | str] = []
     run = pycolmap.incremental_mapping
-    monkeypatch.setattr(hm_sfm.mapping, "SNAPSHOT_IMAGES", 3)
+    monkeypatch.setattr(hm_sfm.colmap.mapping, "SNAPSHOT_IMAGES", 3)
     monkeypatch.setattr(
-        hm_sfm.mapping.pycolmap,
+        hm_sfm.colmap.mapping.pycolmap,
         "incremental_mapping",
         lambda *args, **options: (calls.append(options["input_path"]), run(*args, **options))[1],
     )

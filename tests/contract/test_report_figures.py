@@ -10,15 +10,15 @@ import pycolmap
 import pytest
 
 from hm_sfm.config import Config, fingerprint
-from hm_sfm.diagnosis import Cause, Diagnosis
-from hm_sfm.report_figures import (
+from hm_sfm.report.diagnosis import Cause, Diagnosis
+from hm_sfm.report.gather import (
     MOST_WEAK_PAIRS,
     gather_report,
     lay_out_scene,
     make_upright,
     read_baselines,
 )
-from hm_sfm.tracks import build_tracks, count_neighbours
+from hm_sfm.keypoints.tracks import build_tracks, count_neighbours
 from hm_sfm.types import ImageRef
 
 

@@ -10,9 +10,9 @@ import pycolmap
 import pytest
 from PIL import Image
 
-import hm_sfm.network.model as model
-from hm_sfm.images import list_images, prepare_image
-from hm_sfm.textures import make_texture
+import hm_sfm.matching.matcher as model
+from hm_sfm.photos.images import list_images, prepare_image
+from hm_sfm.synthetic.textures import make_texture
 
 
 def assert_refused(finished, *parts: object, code: int = 2) -> None:
@@ -233,7 +233,7 @@ def test_a_full_disk_keeps_the_model_that_was_there(scene, out, run, monkeypatch
         raise OSError(28, "No space left on device", str(path))
 
     before = digest_files(out)
-    monkeypatch.setattr("hm_sfm.reconstruction.write_database", refuse)
+    monkeypatch.setattr("hm_sfm.pipeline.reconstruction.write_database", refuse)
     finished = run("reconstruct", scene.images, out, "--quiet")
     assert_refused(finished, out / "database.db", "No space left on device")
     assert digest_files(out) == before

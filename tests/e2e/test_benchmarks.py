@@ -14,11 +14,11 @@ import pytest
 import torch
 from PIL import Image
 
-from hm_sfm.coarse_matches import read_rgb, to_px
+from hm_sfm.matching.coarse_matches import read_rgb, to_px
 from hm_sfm.config import Config, VerificationConfig
 from hm_sfm.errors import InputError
-from hm_sfm.images import read_ref
-from hm_sfm.pair_evaluation import PointMatches
+from hm_sfm.photos.images import read_ref
+from hm_sfm.evaluation.relative_poses import PointMatches
 from hm_sfm.types import ImagePair
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"

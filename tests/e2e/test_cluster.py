@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import ray
 
-from hm_sfm import cluster_matching
-from hm_sfm.cluster_matching import PairWorker
+from hm_sfm.matching import ray_engine as cluster_matching
+from hm_sfm.matching.ray_engine import PairWorker
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import h5py
 import pycolmap
 
-from hm_sfm.coordinates import pixel_index_from_px
+from hm_sfm.geometry.frames import pixel_index_from_px
 
 
 def assert_refused(finished, *parts: object) -> None:

@@ -13,9 +13,9 @@ import torch
 from kornia.feature import LoFTR
 
 from hm_sfm.cli import main
-from hm_sfm.hloc import read_features, read_matches
-from hm_sfm.images import list_images
-from hm_sfm.pairs import read_pairs
+from hm_sfm.formats.hloc import read_features, read_matches
+from hm_sfm.photos.images import list_images
+from hm_sfm.pairs.selection import read_pairs
 
 STYLES = ("raw", "1px", "2px", "4px", "8px")
 METHODS = ("persistent", *(f"loftr_style_{style}" for style in STYLES))
@@ -153,15 +153,15 @@ def test_an_interrupted_comparison_goes_on(scene, reconstructed, expectation_wei
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("hm_sfm.comparison.make_keypoints", interrupt)
+        patch.setattr("hm_sfm.evaluation.comparison.make_keypoints", interrupt)
         stopped = run(*command)
     assert stopped.code == 130 and "goes on from here" in stopped.err
     kept = (out / "persistent" / "result.json").stat().st_mtime_ns
     assert (out / "loftr_style" / "matches.h5").exists() and not (out / "compare.json").exists()
 
     with monkeypatch.context() as patch:
-        patch.setattr("hm_sfm.comparison.match_pairs", interrupt)
-        patch.setattr("hm_sfm.comparison.reconstruct", interrupt)
+        patch.setattr("hm_sfm.evaluation.comparison.match_pairs", interrupt)
+        patch.setattr("hm_sfm.evaluation.comparison.reconstruct", interrupt)
         assert run(*command).code == 0
     assert (out / "persistent" / "result.json").stat().st_mtime_ns == kept
     methods = json.loads((out / "compare.json").read_text())["methods"]

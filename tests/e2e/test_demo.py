@@ -12,17 +12,17 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hm_sfm.demo import write_demo
-from hm_sfm.evaluation import ModelScore, read_strecha_cameras, score_model
-from hm_sfm.pairs import read_pairs
+from hm_sfm.synthetic.demo import write_demo
+from hm_sfm.evaluation.poses import ModelScore, read_strecha_cameras, score_model
+from hm_sfm.pairs.selection import read_pairs
 
 # A process that stores each pair at once instead of every 20 s, and that minds Ctrl-C even where the tests were
 # started in the background.
 STORING_EACH_PAIR = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
-import hm_sfm.batches
-hm_sfm.batches.BATCH_SECONDS = 0.0
+import hm_sfm.io.batches
+hm_sfm.io.batches.BATCH_SECONDS = 0.0
 from hm_sfm.cli import main
 sys.exit(main(sys.argv[1:]))
 """

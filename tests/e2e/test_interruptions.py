@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import hm_sfm.batches
+import hm_sfm.io.batches
 from hm_sfm.cli import main
 
 KILLS = int(os.environ.get("KILLS", "5"))
@@ -22,7 +22,7 @@ KILLS = int(os.environ.get("KILLS", "5"))
 def match_here(photos: Path, out: Path, errors: Path, file_limit: int | None) -> None:
     """hm-sfm match in a process forked for it; each pair is stored at once, no file grows beyond file_limit bytes."""
     os.dup2(os.open(errors, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
-    hm_sfm.batches.BATCH_SECONDS = 0.0
+    hm_sfm.io.batches.BATCH_SECONDS = 0.0
     if file_limit:
         resource.setrlimit(resource.RLIMIT_FSIZE, (file_limit, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
     sys.exit(main(["match", str(photos), str(out), "--quiet"]))
@@ -32,7 +32,7 @@ def match_here(photos: Path, out: Path, errors: Path, file_limit: int | None) ->
 def start_matching(tiny_photos, tmp_path_factory):
     """Start hm-sfm match on the tiny photos: OUT, limit of the file size -> process and the file of its stderr."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["hm_sfm.cli", "hm_sfm.reconstruction", "pytest"])
+    context.set_forkserver_preload(["hm_sfm.cli", "hm_sfm.pipeline.reconstruction", "pytest"])
     folder = tmp_path_factory.mktemp("errors")
 
     def start(out: Path, file_limit: int | None = None):
@@ -113,7 +113,7 @@ def test_a_device_without_space(tiny_photos, tmp_path, run, monkeypatch):
     def refuse(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("hm_sfm.store.replace_file", refuse)
+    monkeypatch.setattr("hm_sfm.matching.store.replace_file", refuse)
     out = tmp_path / "out"
     finished = run("match", tiny_photos, out, "--quiet")
     part = out / "matches.h5.parts" / "000000.h5"

@@ -9,11 +9,11 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hm_sfm.database import open_database, read_verified_matches
-from hm_sfm.demo import COLMAP_DIAGONAL_35MM, make_demo_scene, make_demo_views
-from hm_sfm.evaluation import score_model
-from hm_sfm.exif import write_jpeg
-from hm_sfm.rendering import render_view
+from hm_sfm.colmap.database import open_database, read_verified_matches
+from hm_sfm.synthetic.demo import COLMAP_DIAGONAL_35MM, make_demo_scene, make_demo_views
+from hm_sfm.evaluation.poses import score_model
+from hm_sfm.photos.exif import write_jpeg
+from hm_sfm.synthetic.rendering import render_view
 from hm_sfm.types import PinholeView
 
 LENSES = {"camera": ((384, 256), 35), "phone": ((320, 240), 28)}

@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-import hm_sfm.network.model as model
+import hm_sfm.matching.matcher as model
 from hm_sfm.training import loop
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"

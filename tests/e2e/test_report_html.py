@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from hm_sfm.config import Config
-from hm_sfm.report_figures import ImageFigures, Report, Scene, WeakPair
-from hm_sfm.report_page import render_page
+from hm_sfm.report.gather import ImageFigures, Report, Scene, WeakPair
+from hm_sfm.report.page import render_page
 from hm_sfm.types import ImagePair
 
 FLAGS = (

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from hm_sfm.network.model import HomoMatcher
+from hm_sfm.matching.matcher import HomoMatcher
 
 SHARDS = ("1/3", "2/3", "3/3")
 
@@ -175,7 +175,7 @@ def test_shards_chosen_by_looks_encode_one_after_the_other(tiny_photos, tmp_path
         held.append(True)
         return np.full((6, 3), 3**-0.5, np.float32)  # all alike
 
-    monkeypatch.setattr("hm_sfm.reconstruction.describe_images", encode)
+    monkeypatch.setattr("hm_sfm.pipeline.reconstruction.describe_images", encode)
     finished = run("match", tiny_photos, out, "--pairs", "retrieval", "--shard", "1/1")
     assert finished.code == 0, finished.err
     assert held == [True]
@@ -185,7 +185,7 @@ def test_a_folder_without_locks_is_used_all_the_same(tiny_photos, tmp_path, run,
     def refuse(*_):
         raise OSError(95, "Operation not supported")
 
-    monkeypatch.setattr("hm_sfm.locks.fcntl.flock", refuse)
+    monkeypatch.setattr("hm_sfm.io.locks.fcntl.flock", refuse)
     assert run("match", tiny_photos, tmp_path / "out").code == 0
 
 

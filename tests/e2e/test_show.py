@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hm_sfm.exif import write_jpeg
-from hm_sfm.match_pictures import GAP_PX
+from hm_sfm.photos.exif import write_jpeg
+from hm_sfm.report.drawn_matches import GAP_PX
 
 
 def test_show_draws_matches_and_the_warped_photo(scene, tmp_path, run):

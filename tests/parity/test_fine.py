@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig
-from hm_sfm.images import prepare_array
+from hm_sfm.photos.images import prepare_array
 from hm_sfm.network import model
 from hm_sfm.network.coarse import match_by_similarity
 from hm_sfm.network.fine import (

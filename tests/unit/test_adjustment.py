@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hm_sfm.adjustment import Anchors, adjust_keypoints, measure_residuals, predict_targets
+from hm_sfm.keypoints.adjustment import Anchors, adjust_keypoints, measure_residuals, predict_targets
 from hm_sfm.config import KeypointConfig
 
 ROUNDS = KeypointConfig().adjustment_rounds

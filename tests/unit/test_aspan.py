@@ -29,7 +29,7 @@ from hm_sfm.network.aspan import (
     shrink,
 )
 from hm_sfm.network.coarse import AspanCoarse
-from hm_sfm.network.model import HomoMatcher, HomoNet, load_weights
+from hm_sfm.matching.matcher import HomoMatcher, HomoNet, load_weights
 from hm_sfm.training import loop
 from hm_sfm.training.loop import TrainConfig, train
 from hm_sfm.training.losses import FLOW_WEIGHT, measure_coarse_loss, measure_flow_loss

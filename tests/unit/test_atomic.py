@@ -1,6 +1,6 @@
 import pytest
 
-from hm_sfm.atomic import make_folder, replace_file
+from hm_sfm.io.atomic import make_folder, replace_file
 from hm_sfm.errors import InputError
 
 

@@ -1,7 +1,7 @@
 import pytest
 
-from hm_sfm import batches
-from hm_sfm.batches import store_in_batches
+from hm_sfm.io import batches
+from hm_sfm.io.batches import store_in_batches
 
 
 def test_results_are_written_together_at_the_end():

@@ -9,11 +9,11 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from hm_sfm.bitmaps import open_to_colmap, read_bitmap
+from hm_sfm.photos.bitmaps import open_to_colmap, read_bitmap
 from hm_sfm.config import CameraConfig
-from hm_sfm.database import make_cameras
+from hm_sfm.colmap.database import make_cameras
 from hm_sfm.errors import InputError, MissingPackageError
-from hm_sfm.images import list_images, prepare_image, read_ref
+from hm_sfm.photos.images import list_images, prepare_image, read_ref
 
 
 def textured(width: int, height: int) -> np.ndarray:
@@ -97,7 +97,7 @@ def test_damaged_heic_is_skipped(tmp_path, capfd):
 
 def test_without_the_package_one_line_says_how_to_install_it(tmp_path, monkeypatch):
     path = write_photo(tmp_path / "a.heic", textured(64, 48))
-    monkeypatch.setattr("hm_sfm.bitmaps.can_read_heic", lambda: False)
+    monkeypatch.setattr("hm_sfm.photos.bitmaps.can_read_heic", lambda: False)
     with pytest.raises(MissingPackageError, match=r'a.heic is HEIC, .* pip install "hm_sfm\[heif\]"'):
         read_ref(path)
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from hm_sfm import HomoMatcher, coarse_matches
-from hm_sfm.coarse_matches import (
+from hm_sfm import HomoMatcher
+from hm_sfm.matching import coarse_matches
+from hm_sfm.matching.coarse_matches import (
     LightGlueCoarse,
     MatchFile,
     PointPairs,
@@ -23,14 +24,14 @@ from hm_sfm.coarse_matches import (
     match_by_ratio,
 )
 from hm_sfm.config import Config, ImageConfig, MatchingConfig
-from hm_sfm.coordinates import Grid, homography_to_pixel_index
+from hm_sfm.geometry.frames import Grid, homography_to_pixel_index
 from hm_sfm.errors import ConfigError, InputError, MissingPackageError, WeightsError
-from hm_sfm.hloc import write_features, write_matches
-from hm_sfm.images import prepare_array
+from hm_sfm.formats.hloc import write_features, write_matches
+from hm_sfm.photos.images import prepare_array
 from hm_sfm.network import weights_coarse
 from hm_sfm.network.homography import apply_homography, homography_from_corners
-from hm_sfm.network.model import HomoNet, load_weights, make_start, round_to_cells, save_weights
-from hm_sfm.reconstruction import describe_matching
+from hm_sfm.matching.matcher import HomoNet, load_weights, make_start, round_to_cells, save_weights
+from hm_sfm.pipeline.reconstruction import describe_matching
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 SIZE_WH = (256, 192)

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hm_sfm.comparison import (
+from hm_sfm.evaluation.comparison import (
     Method,
     Run,
     add_seconds,
@@ -20,7 +20,7 @@ from hm_sfm.comparison import (
     read_tracks,
 )
 from hm_sfm.config import Config, MappingConfig
-from hm_sfm.database import Cameras
+from hm_sfm.colmap.database import Cameras
 from hm_sfm.types import ImagePair, ImageRef
 
 SECONDS = {"match": 1.239, "keypoints": None, "verify": 0.5, "map": 2.0}

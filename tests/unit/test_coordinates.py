@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hm_sfm.coordinates import Grid, px_from_pixel_index, rotation_matrix
+from hm_sfm.geometry.frames import Grid, px_from_pixel_index, rotation_matrix
 
 sides = st.integers(1, 5000)
 rotations = st.sampled_from((0, 90, 180, 270))

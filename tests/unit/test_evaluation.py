@@ -3,7 +3,7 @@ import pycolmap
 import pytest
 
 from hm_sfm.errors import InputError
-from hm_sfm.evaluation import (
+from hm_sfm.evaluation.poses import (
     compare_poses,
     measure_position_error,
     pose_auc,

@@ -12,8 +12,8 @@ import pytest
 
 from hm_sfm.cli import main
 from hm_sfm.errors import ConfigError, InputError
-from hm_sfm.frames import choose_sharpest, extract_frames, measure_sharpness
-from hm_sfm.images import list_images
+from hm_sfm.photos.videos import choose_sharpest, extract_frames, measure_sharpness
+from hm_sfm.photos.images import list_images
 
 FPS = 10
 SHARP = (3, 14, 20)
@@ -134,7 +134,7 @@ def test_impossible_intervals(every, video, tmp_path, capfd):
 def test_a_video_that_ends_early_gives_what_it_has_and_a_warning(video, tmp_path, caplog):
     data = video.read_bytes()
     video.write_bytes(data[: len(data) // 2])
-    with caplog.at_level(logging.WARNING, logger="hm_sfm.frames"):
+    with caplog.at_level(logging.WARNING, logger="hm_sfm.photos.videos"):
         frames = extract_frames([video], tmp_path / "photos", quiet=True)
     assert next(iter(frames)) == "walk/walk_00000300.jpg" and len(frames) < 3
     (message,) = caplog.messages

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hm_sfm.errors import InputError
-from hm_sfm.hloc import read_features, read_matches, write_features, write_matches
+from hm_sfm.formats.hloc import read_features, read_matches, write_features, write_matches
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 NAMES = ("a.jpg", "left/with space.jpg", "right/Köln — 教会.png")

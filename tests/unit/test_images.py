@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hm_sfm.errors import ConfigError, InputError
-from hm_sfm.images import ImageList, list_images, prepare_array, prepare_image, read_ref
+from hm_sfm.photos.images import ImageList, list_images, prepare_array, prepare_image, read_ref
 
 # 48 x 32 px, the left upper quarter 220, the rest 40; OpenCV cannot write CMYK.
 CMYK_JPEG = base64.b64decode(
@@ -114,7 +114,7 @@ def test_unusable_images_are_skipped_and_reported(tmp_path, caplog):
     (tmp_path / "dangling.png").symlink_to(tmp_path / "gone.png")
     write(tmp_path / "small.png", encode(textured(31, 500), ".png"))
 
-    with caplog.at_level(logging.WARNING, logger="hm_sfm.images"):
+    with caplog.at_level(logging.WARNING, logger="hm_sfm.photos.images"):
         listing = list_images(tmp_path)
 
     assert [ref.name for ref in listing.images] == ["good.jpg"]
@@ -127,7 +127,7 @@ def test_unusable_images_are_skipped_and_reported(tmp_path, caplog):
 
 
 def test_heic_photos_are_skipped_with_one_warning_that_says_what_to_do(tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr("hm_sfm.images.can_read_heic", lambda: False)
+    monkeypatch.setattr("hm_sfm.photos.images.can_read_heic", lambda: False)
     for name in ("IMG_2.HEIC", "sub/IMG_1.heic", "IMG_3.heif"):
         write(tmp_path / name, b"\0\0\0\x18ftypheic")
     with pytest.raises(InputError, match="holds 3 images but none can be used.*IMG_2.HEIC is HEIC.*convert it to JPEG"):

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hm_sfm.budget import choose_budget, rank_in_groups
+from hm_sfm.keypoints.selection import choose_budget, rank_in_groups
 from hm_sfm.config import KeypointConfig
-from hm_sfm.images import prepare_array
-from hm_sfm.keypoints import (
+from hm_sfm.photos.images import prepare_array
+from hm_sfm.keypoints.propagation import (
     CARRYING,
     Photo,
     choose_good,

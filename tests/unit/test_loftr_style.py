@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hm_sfm.loftr_style import keep_best, keep_most_voted, make_keypoints, merge_duplicates, snap_points
+from hm_sfm.evaluation.loftr_style import keep_best, keep_most_voted, make_keypoints, merge_duplicates, snap_points
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
 

@@ -12,8 +12,8 @@ import torch
 
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.network.backbone import LightBackbone
-from hm_sfm.rendering import Quad, render_view
-from hm_sfm.textures import make_texture
+from hm_sfm.synthetic.rendering import Quad, render_view
+from hm_sfm.synthetic.textures import make_texture
 from hm_sfm.training import megadepth
 from hm_sfm.training.megadepth import (
     DepthView,

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hm_sfm.neighbours import find_nearest, find_pairs_within
+from hm_sfm.geometry.nearest import find_nearest, find_pairs_within
 
 # Quarters are exact in floating point: points exactly `radius` away count as within.
 quarters = st.integers(-40, 40).map(lambda n: n / 4)

@@ -2,11 +2,11 @@ import cv2
 import numpy as np
 import pytest
 
-from hm_sfm.coordinates import homography_from_pixel_index, homography_to_pixel_index
+from hm_sfm.geometry.frames import homography_from_pixel_index, homography_to_pixel_index
 from hm_sfm.errors import InputError
-from hm_sfm.evaluation import write_strecha_cameras
-from hm_sfm.network.model import HomoMatcher
-from hm_sfm.pair_evaluation import (
+from hm_sfm.evaluation.poses import write_strecha_cameras
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.evaluation.relative_poses import (
     PointMatches,
     PosePair,
     estimate_pose_colmap,
@@ -17,7 +17,7 @@ from hm_sfm.pair_evaluation import (
     score_homographies,
     score_pose_matches,
 )
-from hm_sfm.textures import make_texture
+from hm_sfm.synthetic.textures import make_texture
 from hm_sfm.types import PatchMatches, PinholeView
 
 K0 = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hm_sfm.config import PairConfig
 from hm_sfm.errors import ConfigError, InputError
-from hm_sfm.pairs import pair_exhaustively, pair_sequentially, read_pairs, select_pairs, write_pairs
+from hm_sfm.pairs.selection import pair_exhaustively, pair_sequentially, read_pairs, select_pairs, write_pairs
 from hm_sfm.types import ImagePair
 
 counts = st.integers(2, 60)

@@ -8,7 +8,7 @@ import pytest
 
 from hm_sfm.cli import main
 from hm_sfm.errors import InputError
-from hm_sfm.point_evaluation import PATCH_POINTS, measure_matches, measure_points, score_points
+from hm_sfm.evaluation.points import PATCH_POINTS, measure_matches, measure_points, score_points
 from hm_sfm.training.photos import split_photos
 from hm_sfm.training.validation import make_validation_pairs
 from hm_sfm.types import PatchMatches, apply_homographies

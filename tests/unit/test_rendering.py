@@ -2,11 +2,11 @@ import numpy as np
 import pycolmap
 import pytest
 
-import hm_sfm.demo
-from hm_sfm.demo import expose_photo, make_box, make_demo_scene, make_demo_views, write_demo
-from hm_sfm.evaluation import read_strecha_cameras
-from hm_sfm.rendering import Quad, render_view
-from hm_sfm.textures import MATERIALS, make_texture
+import hm_sfm.synthetic.demo
+from hm_sfm.synthetic.demo import expose_photo, make_box, make_demo_scene, make_demo_views, write_demo
+from hm_sfm.evaluation.poses import read_strecha_cameras
+from hm_sfm.synthetic.rendering import Quad, render_view
+from hm_sfm.synthetic.textures import MATERIALS, make_texture
 from hm_sfm.types import PinholeView
 
 BLACK = (0.0, 0.0, 0.0)
@@ -212,7 +212,7 @@ def test_photo_has_noise_and_exposure_of_its_own():
 def test_demo_files_hold_the_cameras_they_were_rendered_with(tmp_path, monkeypatch):
     # A small scene in place of the courtyard: what is tested here is what is written.
     scene = make_box(np.random.default_rng(0), "mural", (0, 1), (3, 3, 2), 20, texels_per_m=40)
-    monkeypatch.setattr(hm_sfm.demo, "make_demo_scene", lambda seed: scene)
+    monkeypatch.setattr(hm_sfm.synthetic.demo, "make_demo_scene", lambda seed: scene)
     views = write_demo(tmp_path / "a", seed=0, count=3, size_wh=(160, 120))
     assert list(views) == ["view_00.jpg", "view_01.jpg", "view_02.jpg"]
     truth = read_strecha_cameras(tmp_path / "a" / "ground_truth")

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from hm_sfm.config import Config
-from hm_sfm.diagnosis import Cause, Diagnosis
-from hm_sfm.report_figures import ImageFigures, Report, Scene, WeakPair
-from hm_sfm.report_page import LABEL_LENGTH, MOST_LINKS, render_page, write_report
+from hm_sfm.report.diagnosis import Cause, Diagnosis
+from hm_sfm.report.gather import ImageFigures, Report, Scene, WeakPair
+from hm_sfm.report.page import LABEL_LENGTH, MOST_LINKS, render_page, write_report
 from hm_sfm.types import ImagePair
 
 EVIL = "a</script><b onclick='x'>&\"é .jpg"

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from hm_sfm import batches, retrieval
+from hm_sfm.io import batches
+from hm_sfm.pairs import retrieval
 from hm_sfm.config import Config, ImageConfig, MatchingConfig, NetworkConfig, PairConfig
 from hm_sfm.errors import InputError
-from hm_sfm.images import CV_ROTATIONS, prepare_array, read_ref
-from hm_sfm.network.model import HomoMatcher, HomoNet
-from hm_sfm.pairs import select_pairs
-from hm_sfm.reconstruction import choose_pairs
-from hm_sfm.retrieval import (
+from hm_sfm.photos.images import CV_ROTATIONS, prepare_array, read_ref
+from hm_sfm.matching.matcher import HomoMatcher, HomoNet
+from hm_sfm.pairs.selection import select_pairs
+from hm_sfm.pipeline.reconstruction import choose_pairs
+from hm_sfm.pairs.retrieval import (
     CELLS_PER_IMAGE,
     CellStore,
     count_words,
@@ -23,7 +24,7 @@ from hm_sfm.retrieval import (
     sample_cells,
     weigh_words,
 )  # fmt: skip
-from hm_sfm.textures import make_texture
+from hm_sfm.synthetic.textures import make_texture
 from hm_sfm.types import ImageRef
 
 CHANNELS = 16
@@ -289,7 +290,7 @@ def test_plain_features_are_those_that_the_coarse_stage_starts_from(backbone, co
 def test_choosing_pairs_encodes_only_where_looks_matter(ring, tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(HomoMatcher, "from_pretrained", lambda *_, **__: asked.append(1) or ring)
-    monkeypatch.setattr("hm_sfm.reconstruction.digest_image", lambda image: ring.digests[image.name])
+    monkeypatch.setattr("hm_sfm.pipeline.reconstruction.digest_image", lambda image: ring.digests[image.name])
     exhaustive = choose_pairs(ring.images, tmp_path / "out", Config(), quiet=True)
     assert len(exhaustive) == 60 * 59 // 2 and not asked and not (tmp_path / "out").exists()
     pairing, matching = PairConfig(mode="retrieval", retrieval_top=4), MatchingConfig(retry_turned=False)

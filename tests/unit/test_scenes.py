@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from hm_sfm.network.backbone import LightBackbone
-from hm_sfm.textures import make_texture
+from hm_sfm.synthetic.textures import make_texture
 from hm_sfm.training.photos import POINTS, SURFACES
 from hm_sfm.training.scenes import (
     Facet,

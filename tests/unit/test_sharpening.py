@@ -6,16 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from hm_sfm import sharpening
+from hm_sfm.keypoints import refinement as sharpening
 from hm_sfm.config import ImageConfig, KeypointConfig, MatchingConfig
-from hm_sfm.coordinates import homography_to_pixel_index
+from hm_sfm.geometry.frames import homography_to_pixel_index
 from hm_sfm.errors import ConfigError
-from hm_sfm.images import prepare_image, read_ref
-from hm_sfm.keypoints import Carried, LinkedKeypoints, Links, Photo, differentiate, finish_keypoints
+from hm_sfm.photos.images import prepare_image, read_ref
+from hm_sfm.keypoints.propagation import Carried, LinkedKeypoints, Links, Photo, differentiate, finish_keypoints
 from hm_sfm.network.fine import ExpectationHead
-from hm_sfm.network.model import HomoMatcher
-from hm_sfm.sharpening import encode_native, fit_variants, sharpen_links
-from hm_sfm.store import digest_image
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.keypoints.refinement import encode_native, fit_variants, sharpen_links
+from hm_sfm.matching.store import digest_image
 from hm_sfm.types import apply_homographies
 
 SIZE_WH = (768, 576)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from hm_sfm.snapshots import Snapshots
+from hm_sfm.colmap.snapshots import Snapshots
 
 
 def write_snapshot(growing: Path, content: str) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hm_sfm.errors import InputError, StaleResultError
-from hm_sfm.store import MatchStore, digest_image
+from hm_sfm.matching.store import MatchStore, digest_image
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
 MADE_BY = {"weights": "abc", "matching.max_matches": 8000, "images.long_edge_px": 1024}
@@ -132,7 +132,7 @@ def test_a_crash_while_merging_loses_nothing(tmp_path, batch, monkeypatch):
     def crash(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("hm_sfm.atomic.os.replace", crash)
+    monkeypatch.setattr("hm_sfm.io.atomic.os.replace", crash)
     with pytest.raises(KeyboardInterrupt):
         store.merge()
     monkeypatch.undo()

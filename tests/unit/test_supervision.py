@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from hm_sfm.coordinates import Grid
+from hm_sfm.geometry.frames import Grid
 from hm_sfm.network.backbone import LightBackbone
 from hm_sfm.network.fine import FineEstimate
 from hm_sfm.network.homography import apply_homography, homography_from_corners, make_corners

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hm_sfm.tracks import build_tracks, label_components, label_tracks, measure_lengths
+from hm_sfm.keypoints.tracks import build_tracks, label_components, label_tracks, measure_lengths
 
 
 def label(count, edges, scores, images):

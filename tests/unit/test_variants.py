@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from tqdm import tqdm
 
-from hm_sfm.coarse_matches import read_rgb
+from hm_sfm.matching.coarse_matches import read_rgb
 from hm_sfm.config import ImageConfig, MatchingConfig
-from hm_sfm.coordinates import pixel_index_from_px, rotation_matrix
-from hm_sfm.images import CV_ROTATIONS, prepare_array, prepare_image, read_ref
-from hm_sfm.matching import FeatureCache
-from hm_sfm.network.model import HomoMatcher
-from hm_sfm.textures import MATERIALS, make_texture
+from hm_sfm.geometry.frames import pixel_index_from_px, rotation_matrix
+from hm_sfm.photos.images import CV_ROTATIONS, prepare_array, prepare_image, read_ref
+from hm_sfm.matching.run import FeatureCache
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.synthetic.textures import MATERIALS, make_texture
 from hm_sfm.types import ImagePair, PatchMatches, apply_homographies
-from hm_sfm.variants import (
+from hm_sfm.matching.hypotheses import (
     AS_THEY_ARE,
     FEW_MATCHES,
     SCALES,

@@ -1,0 +1,434 @@
+"""Stage 7: mapping, triangulation and bundle adjustment, through pycolmap.
+
+Ctrl-C raises KeyboardInterrupt out of each of these functions within a second or so: pycolmap asks for signals while
+it works; the last adjustment of a model, the global mapper and triangulation run through. What is written to disk
+appears at once and complete, or not at all.
+"""
+
+import logging
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from hm_sfm.photos.bitmaps import open_to_colmap
+from hm_sfm.colmap.models import quiet_colmap
+from hm_sfm.config import MappingConfig
+from hm_sfm.colmap.database import Cameras, open_database
+from hm_sfm.errors import ConfigError
+from hm_sfm.colmap.rigs import lack_poses
+from hm_sfm.colmap.snapshots import SNAPSHOT_FOLDER, Snapshots, digest_inputs
+from hm_sfm.types import ImageRef, MappingResult
+
+logger = logging.getLogger(__name__)
+
+# Global bundle adjustment each time the model grew by 30 %, not COLMAP's 10 %: about a fifth less time on dense
+# keypoints, at the same result; local bundle adjustment follows every image anyway.
+GLOBAL_ADJUSTMENT_RATIO = 1.3
+
+# Observations farther from their point than this are dropped: what verification allows by default. COLMAP's own 4 px are
+# meant for keypoints that are less exact.
+FILTER_ERROR_PX = 3.0
+
+# Error of matches that calibration allows, of the longer side of the photos: what verification allows by default.
+CALIBRATION_ERROR = 0.003
+
+# While a model grows, its adjustments end where they gain less than this (relative); the last one, over everything, is
+# exact. Half the time of COLMAP's own limits; points and poses are the same to a tenth of their error.
+GLOBAL_TOLERANCE = 1e-4
+LOCAL_TOLERANCE = 1e-3
+GLOBAL_REFINEMENTS = 2
+LOCAL_REFINEMENTS = 1
+
+# Images, or frames of rigs, that a model gains from one snapshot to the next: mapping them takes longer by far than
+# writing it.
+SNAPSHOT_IMAGES = 20
+
+
+def map_images(
+    database_path: Path,
+    image_folder: Path,
+    sparse_folder: Path,
+    images: Sequence[ImageRef],
+    cameras: Cameras,
+    config: MappingConfig,
+    on_image: Callable[[], None] | None = None,
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """Build models from a verified database: triangulate_images where the poses are known, else by `config.mapper`.
+
+    images, cameras: those that the database was written with. Where their rigs lack poses, calibrate_rigs finds them
+    first. Arguments, results and what is raised are otherwise those of map_incrementally; raises ConfigError where
+    there is no such mapper.
+    """
+    if cameras.cam_from_world:
+        with open_to_colmap(images, image_folder) as readable_folder:
+            return triangulate_images(database_path, readable_folder, sparse_folder, images, cameras, config, on_image)
+    build = choose_mapper(config)
+    with open_to_colmap(images, image_folder) as readable_folder:
+        if lack_poses(cameras.rigs):
+            calibrate_rigs(database_path, readable_folder, cameras, config)
+        return build(database_path, readable_folder, sparse_folder, config, cameras.known, on_image)
+
+
+def choose_mapper(config: MappingConfig) -> Callable[..., tuple[pycolmap.Reconstruction, ...]]:
+    """map_incrementally or map_globally. Raises ConfigError where `config.mapper` is neither."""
+    mappers = {"incremental": map_incrementally, "global": map_globally}
+    if config.mapper not in mappers:
+        raise ConfigError(f"mapping.mapper must be incremental or global, found {config.mapper!r}")
+    return mappers[config.mapper]
+
+
+def calibrate_rigs(database_path: Path, image_folder: Path, cameras: Cameras, config: MappingConfig) -> bool:
+    """Find the poses that `cameras.rigs` lack, and write them to the database, as COLMAP's rig_configurator does it.
+
+    A model is built as if there were no rigs, by `config.mapper`; the poses are averages over it. COLMAP needs them to
+    map with rigs. Returns whether they were found; where not, the database has no rigs any more, and a warning is
+    logged.
+    """
+    database_path = Path(database_path)
+    with _make_work_folder(database_path.parent, ".rigs.") as work_folder:
+        own_copy = work_folder / "database.db"
+        shutil.copy(database_path, own_copy)
+        with quiet_colmap(pycolmap.logging.FATAL), pycolmap.Database.open(own_copy) as database:
+            pycolmap.apply_rig_config([], database)
+        build = choose_mapper(config)
+        models = build(own_copy, image_folder, work_folder / "sparse", config, cameras.known)
+        with quiet_colmap(pycolmap.logging.FATAL), pycolmap.Database.open(own_copy) as database:
+            if models:
+                pycolmap.apply_rig_config(list(cameras.rigs), database, models[0])
+            sensors = [pose for rig in database.read_all_rigs() for pose in rig.non_ref_sensors.values()]
+            is_complete = bool(sensors) and all(pose is not None for pose in sensors)
+            if not is_complete:
+                pycolmap.apply_rig_config([], database)
+        os.replace(own_copy, database_path)
+    if not is_complete:
+        logger.warning(
+            "the rigs are left out: no model has photos of all their cameras, from which the missing "
+            "cam_from_rig_rotation and cam_from_rig_translation could be found"
+        )
+    return is_complete
+
+
+def map_incrementally(
+    database_path: Path,
+    image_folder: Path,
+    sparse_folder: Path,
+    config: MappingConfig,
+    fix_intrinsics: bool,
+    on_image: Callable[[], None] | None = None,
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """Build models from a verified database with COLMAP's incremental mapper, then adjust and filter each of them.
+
+    image_folder: for the colours of the points. fix_intrinsics: keep all cameras as the database has them.
+    on_image: called once per registered image, of a rig once per frame; the mapper may register an image again in
+    another model or attempt.
+
+    While a model grows, the folder `snapshots` beside `sparse_folder` holds its newest snapshot. The same call goes on
+    from there after it was killed; snapshots of another database or configuration are not used.
+
+    Returns the models, most registered images first, then most points. They are also in `sparse_folder`/0, 1, ... as
+    COLMAP binary, in this order; what the folder held before is gone, and without a model there is no folder.
+    Raises InputError where there is no database.
+    """
+    return _write_models(
+        database_path,
+        sparse_folder,
+        lambda raw: _run_mapper(
+            database_path,
+            image_folder,
+            raw,
+            config,
+            fix_intrinsics,
+            on_image,
+            Path(sparse_folder).with_name(SNAPSHOT_FOLDER),
+        ),
+    )
+
+
+def map_globally(
+    database_path: Path,
+    image_folder: Path,
+    sparse_folder: Path,
+    config: MappingConfig,
+    fix_intrinsics: bool,
+    on_image: Callable[[], None] | None = None,
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """As map_incrementally, with COLMAP's global mapper: the rotations of all images, then all positions and points.
+
+    Focal lengths that nothing is known about are found first, from all pairs together; where that does not lead to a
+    model of all images, the guess of make_cameras is tried, too. The database stays as it is. on_image is called when
+    all is done. The global mapper cannot be interrupted.
+
+    It needs matches that are one to one and tracks with one keypoint per image, which IndexMatches and
+    persist_keypoints guarantee: it stops at a match that occurs twice, and drops tracks whose observations in one image
+    are more than 10 px apart.
+    """
+    return _write_models(
+        database_path,
+        sparse_folder,
+        lambda raw: _run_global_mapper(database_path, image_folder, raw, config, fix_intrinsics, on_image),
+    )
+
+
+def triangulate_images(
+    database_path: Path,
+    image_folder: Path,
+    sparse_folder: Path,
+    images: Sequence[ImageRef],
+    cameras: Cameras,
+    config: MappingConfig,
+    on_image: Callable[[], None] | None = None,
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """The points of a verified database by the poses `cameras.cam_from_world`; poses and intrinsics stay as they are.
+
+    images, cameras: those that the database was written with. on_image is called when all is done.
+
+    Returns one model with all images, or none where no point was found; `sparse_folder` is as map_incrementally leaves
+    it. Raises InputError where there is no database.
+    """
+    return _write_models(
+        database_path,
+        sparse_folder,
+        lambda raw: _run_triangulator(database_path, image_folder, raw, images, cameras, config, on_image),
+    )
+
+
+def _write_models(
+    database_path: Path, sparse_folder: Path, build: Callable[[Path], list[pycolmap.Reconstruction]]
+) -> tuple[pycolmap.Reconstruction, ...]:
+    """Sort the models that `build` makes, given a new folder to work in, and put them in the place of `sparse_folder`.
+
+    Snapshots of them are then removed, and so is what killed processes left. Without verified matches there is nothing
+    to build. Raises InputError where there is no database.
+    """
+    sparse_folder = Path(sparse_folder)
+    sparse_folder.parent.mkdir(parents=True, exist_ok=True)
+    with open_database(database_path) as database:
+        can_map = database.num_inlier_matches() > 0  # rejected pairs count as verified pairs, without inliers
+    with _make_work_folder(sparse_folder.parent, f".{sparse_folder.name}.") as work_folder:
+        models: list[pycolmap.Reconstruction] = []
+        if can_map:
+            raw = work_folder / "mapper"
+            raw.mkdir()
+            # The one error that COLMAP logs here is that there is no model, which the caller is told anyway.
+            with quiet_colmap(pycolmap.logging.FATAL):
+                models = build(raw)
+        models.sort(key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
+
+        finished = work_folder / "sparse"
+        for number, model in enumerate(models):
+            folder = finished / str(number)
+            folder.mkdir(parents=True)
+            model.write_binary(folder)
+        if sparse_folder.exists():
+            os.replace(sparse_folder, work_folder / "replaced")
+        if models:
+            os.replace(finished, sparse_folder)
+        snapshots = sparse_folder.with_name(SNAPSHOT_FOLDER)
+        if snapshots.exists():  # all of them at once: none is left with files missing
+            os.replace(snapshots, work_folder / "snapshots")
+    return tuple(models)
+
+
+@contextmanager
+def _make_work_folder(parent: Path, prefix: str) -> Iterator[Path]:
+    """A folder for the block, in the place of those that killed processes left."""
+    for left in parent.glob(f"{prefix}*/"):
+        shutil.rmtree(left)
+    with tempfile.TemporaryDirectory(dir=parent, prefix=prefix) as folder:
+        yield Path(folder)
+
+
+def _run_mapper(
+    database_path: Path,
+    image_folder: Path,
+    output_folder: Path,
+    config: MappingConfig,
+    fix_intrinsics: bool,
+    on_image: Callable[[], None] | None,
+    snapshot_folder: Path,
+) -> list[pycolmap.Reconstruction]:
+    options = _pipeline_options(config, fix_intrinsics)
+    made_from = digest_inputs(database_path, config, fix_intrinsics)
+    snapshots = Snapshots(snapshot_folder, output_folder.with_name("growing"), made_from)
+    options.snapshot_path = snapshots.growing
+    options.snapshot_frames_freq = SNAPSHOT_IMAGES
+    on_image = on_image or (lambda: None)
+
+    def on_first_images() -> None:
+        for _ in range(snapshots.begin_model()):
+            on_image()
+
+    def on_next_image() -> None:
+        snapshots.add_image()
+        on_image()
+
+    models = pycolmap.incremental_mapping(
+        database_path,
+        image_folder,
+        output_folder,
+        options,
+        input_path=snapshots.newest or "",
+        initial_image_pair_callback=on_first_images,
+        next_image_callback=on_next_image,
+    )
+    for model in models.values():
+        _adjust(model, options)
+    return list(models.values())
+
+
+def _pipeline_options(config: MappingConfig, fix_intrinsics: bool) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = config.seed
+    options.min_model_size = config.min_model_size
+    options.mapper.filter_max_reproj_error = FILTER_ERROR_PX
+    options.ba_global_frames_ratio = GLOBAL_ADJUSTMENT_RATIO
+    options.ba_global_points_ratio = GLOBAL_ADJUSTMENT_RATIO
+    options.ba_global_function_tolerance = GLOBAL_TOLERANCE
+    options.ba_local_function_tolerance = LOCAL_TOLERANCE
+    options.ba_global_max_refinements = GLOBAL_REFINEMENTS
+    options.ba_local_max_refinements = LOCAL_REFINEMENTS
+    if fix_intrinsics:
+        options.ba_refine_focal_length = False
+        options.ba_refine_principal_point = False
+        options.ba_refine_extra_params = False
+        options.max_extra_param = np.inf  # known distortion, however strong, is no sign of a failed calibration
+    return options
+
+
+def _run_global_mapper(
+    database_path: Path,
+    image_folder: Path,
+    output_folder: Path,
+    config: MappingConfig,
+    fix_intrinsics: bool,
+    on_image: Callable[[], None] | None,
+) -> list[pycolmap.Reconstruction]:
+    with open_database(database_path) as database:
+        cameras = database.read_all_cameras()
+        pair_ids, geometries = database.read_two_view_geometries()
+    verified = [pair_id for pair_id, geometry in zip(pair_ids, geometries) if len(geometry.inlier_matches)]
+    num_connected = len({image_id for pair_id in verified for image_id in pycolmap.pair_id_to_image_pair(pair_id)})
+    unknown_focal = not fix_intrinsics and not all(camera.has_prior_focal_length for camera in cameras)
+
+    def rank(models: list[pycolmap.Reconstruction]) -> tuple[int, int]:
+        return max(((model.num_reg_images(), model.num_points3D()) for model in models), default=(0, 0))
+
+    best: list[pycolmap.Reconstruction] = []
+    # Where all cameras look at one point, two views say nothing about the focal length, and calibration may return
+    # anything: the first guess, which adjustment refines, is then the better start.
+    for calibrate in (True, False) if unknown_focal else (False,):
+        own_copy = output_folder / "database.db"  # calibration writes to it
+        shutil.copy(database_path, own_copy)
+        if calibrate:
+            max_error_px = CALIBRATION_ERROR * max(max(camera.width, camera.height) for camera in cameras)
+            options = pycolmap.ViewGraphCalibrationOptions(random_seed=config.seed, relpose_max_error=max_error_px)
+            if not pycolmap.calibrate_view_graph(own_copy, options):
+                continue
+        best = max(best, _map_all(own_copy, image_folder, output_folder, config, fix_intrinsics), key=rank)
+        if rank(best)[0] == num_connected:
+            break
+    _report_images(best, on_image)
+    return best
+
+
+def _map_all(
+    database_path: Path, image_folder: Path, output_folder: Path, config: MappingConfig, fix_intrinsics: bool
+) -> list[pycolmap.Reconstruction]:
+    """The global mapper's models, adjusted, without the images that hardly any point supports."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = config.seed
+    options.min_model_size = config.min_model_size
+    if fix_intrinsics:
+        options.mapper.bundle_adjustment.refine_focal_length = False
+        options.mapper.bundle_adjustment.refine_principal_point = False
+        options.mapper.bundle_adjustment.refine_extra_params = False
+        options.mapper.retriangulation.max_extra_param = np.inf
+    models = list(pycolmap.global_mapping(database_path, image_folder, output_folder, options).values())
+    adjustment = _pipeline_options(config, fix_intrinsics)
+    for model in models:
+        _adjust(model, adjustment)
+        # It poses every image, the incremental mapper only those that so many points agree with.
+        fewest = adjustment.mapper.abs_pose_min_num_inliers
+        frames = {image.frame_id for image in model.images.values() if image.num_points3D >= fewest}
+        for frame_id in set(model.reg_frame_ids()) - frames:
+            model.deregister_frame(frame_id)
+    return [model for model in models if model.num_reg_images() >= config.min_model_size]
+
+
+def _run_triangulator(
+    database_path: Path,
+    image_folder: Path,
+    output_folder: Path,
+    images: Sequence[ImageRef],
+    cameras: Cameras,
+    config: MappingConfig,
+    on_image: Callable[[], None] | None,
+) -> list[pycolmap.Reconstruction]:
+    model = pycolmap.Reconstruction()
+    for camera in cameras.cameras:
+        model.add_camera_with_trivial_rig(camera)
+    rows = zip(images, cameras.camera_index, cameras.cam_from_world, strict=True)
+    for image_id, (image, index, cam_from_world) in enumerate(rows, start=1):  # the ids of write_database
+        row = pycolmap.Image(name=image.name, camera_id=cameras.cameras[index].camera_id, image_id=image_id)
+        model.add_image_with_trivial_frame(row, cam_from_world)
+    options = _pipeline_options(config, fix_intrinsics=True)
+    model = pycolmap.triangulate_points(model, database_path, image_folder, output_folder, options=options)
+    if not model.num_points3D():
+        return []
+    model.update_point_3d_errors()
+    _report_images([model], on_image)
+    return [model]
+
+
+def _report_images(models: Sequence[pycolmap.Reconstruction], on_image: Callable[[], None] | None) -> None:
+    """Call on_image for each registered image."""
+    for _ in range(sum(model.num_reg_images() for model in models) if on_image else 0):
+        on_image()
+
+
+def _adjust(model: pycolmap.Reconstruction, options: pycolmap.IncrementalPipelineOptions) -> None:
+    """Adjust all of a model once more, and drop observations as COLMAP's mapper does after each adjustment."""
+    adjustment = pycolmap.BundleAdjustmentOptions()
+    adjustment.refine_focal_length = options.ba_refine_focal_length
+    adjustment.refine_principal_point = options.ba_refine_principal_point
+    adjustment.refine_extra_params = options.ba_refine_extra_params
+    adjustment.print_summary = False
+    extent = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        extent.add_image(image_id)
+    extent.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Not pycolmap.bundle_adjustment, which does the same but turns COLMAP's messages back on.
+    pycolmap.create_default_bundle_adjuster(adjustment, extent, model).solve()
+    limits = options.mapper
+    pycolmap.ObservationManager(model).filter_all_points3D(limits.filter_max_reproj_error, limits.filter_min_tri_angle)
+    model.update_point_3d_errors()
+
+
+def summarise_models(models: Sequence[pycolmap.Reconstruction], num_images: int) -> MappingResult:
+    """The figures of the largest model, `models[0]`; all 0 where there is none.
+
+    num_images: of the collection, registered or not. A track's length is the number of distinct images that see it;
+    mean_reprojection_px is the mean over the points of each point's mean error, as COLMAP prints it.
+    """
+    if not models:
+        return MappingResult((), num_images, 0, 0, 0, 0.0, 0.0)
+    model = models[0]
+    points = model.num_points3D()
+    sightings = sum(
+        len({point2D.point3D_id for point2D in image.get_observation_points2D()}) for image in model.images.values()
+    )
+    return MappingResult(
+        models=tuple(models),
+        num_images=num_images,
+        registered=model.num_reg_images(),
+        points=points,
+        observations=model.compute_num_observations(),
+        mean_track_length=sightings / points if points else 0.0,
+        mean_reprojection_px=model.compute_mean_reprojection_error(),
+    )

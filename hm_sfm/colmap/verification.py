@@ -1,0 +1,192 @@
+"""Stage 4 and 7: two-view geometry, through pycolmap: which matches agree, and which pairs are convincing.
+
+Ctrl-C raises KeyboardInterrupt out of each of these functions within a second or so.
+"""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from tqdm import tqdm
+
+from hm_sfm.colmap.models import quiet_colmap
+from hm_sfm.config import VerificationConfig
+from hm_sfm.colmap.database import open_database
+from hm_sfm.types import ImagePair, ImageRef, PairMatches, freeze_array
+
+# Fewer matches than this prove nothing about an epipolar geometry.
+FEWEST_MATCHES = 8
+
+# verify_pair fits the geometry to at most so many matches and then tests all of them: the time of a trial grows with
+# the matches, the precision of the fit hardly does.
+FIT_MATCHES = 1000
+
+# Enough for 30 % inliers; pairs with more stop earlier, and pairs of different places never need to find anything.
+MAX_TRIALS = 1500
+
+
+@dataclass(frozen=True)
+class VerifiedPair:
+    """A pair of images whose matches agree with a two-view geometry."""
+
+    pair: ImagePair
+    inliers: np.ndarray
+    """(M,) bool: which of the pair's matches agree."""
+    strength: float
+    """Number of inliers times the share of the image that they cover, in the image where it is smaller."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "inliers", freeze_array(self.inliers, np.bool_, (None,), "inliers"))
+
+
+def _two_view_options(max_error_px: float, min_inliers: int, min_inlier_ratio: float, seed: int):
+    options = pycolmap.TwoViewGeometryOptions()
+    options.min_num_inliers = min_inliers
+    options.min_inlier_ratio = min_inlier_ratio
+    options.detect_watermark = False  # a label that nothing here reads
+    options.ransac.max_error = max_error_px
+    options.ransac.max_num_trials = MAX_TRIALS
+    options.ransac.random_seed = seed
+    return options
+
+
+def verify_pair(
+    matches: PairMatches,
+    camera0: pycolmap.Camera,
+    camera1: pycolmap.Camera,
+    max_error_px: float,
+    min_inliers: int,
+    min_inlier_ratio: float,
+    seed: int = 0,
+) -> np.ndarray:
+    """Which matches agree with the two-view geometry of their images.
+
+    camera0, camera1: of image 0 and 1; where both have a known focal length, the geometry is calibrated. Pairs that
+    see a plane, or that only rotate, are valid: matches then agree with a homography.
+    max_error_px: px of the stored images.
+
+    Returns (M,) bool, the same for the same seed; all False where fewer than `min_inliers` or a smaller part than
+    `min_inlier_ratio` of the matches agree, and for fewer than 8 matches.
+    """
+    rejected = np.zeros(len(matches), dtype=bool)
+    if len(matches) < FEWEST_MATCHES:
+        return rejected
+    xy0 = matches.xy0.astype(np.float64)
+    xy1 = matches.xy1.astype(np.float64)
+    # Matches come best first: even steps keep the mixture of good and bad, and the spread over the image.
+    chosen = np.linspace(0, len(matches) - 1, min(len(matches), FIT_MATCHES)).round().astype(np.int64)
+    identity = np.repeat(np.arange(len(chosen), dtype=np.uint32)[:, None], 2, axis=1)
+    with quiet_colmap():
+        geometry = pycolmap.estimate_two_view_geometry(
+            camera0,
+            xy0[chosen],
+            camera1,
+            xy1[chosen],
+            identity,
+            _two_view_options(max_error_px, FEWEST_MATCHES, 0.0, seed),
+        )
+
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    kind = kinds(geometry.config)
+    inliers = rejected
+    if kind == kinds.UNCALIBRATED:
+        inliers = _epipolar_inliers(xy0, xy1, geometry.F, max_error_px)
+    elif kind in (kinds.CALIBRATED, kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):
+        # As COLMAP does: a plane that dominates the pair must not cost it what stands before the plane.
+        if geometry.E is not None:
+            max_error = np.mean([camera.cam_from_img_threshold(max_error_px) for camera in (camera0, camera1)])
+            inliers = _epipolar_inliers(camera0.cam_from_img(xy0), camera1.cam_from_img(xy1), geometry.E, max_error)
+        if kind != kinds.CALIBRATED:
+            planar = _planar_inliers(xy0, xy1, geometry.H, max_error_px)
+            inliers = max(inliers, planar, key=np.count_nonzero)
+    accepted = np.count_nonzero(inliers) >= max(min_inliers, min_inlier_ratio * len(matches))
+    return inliers if accepted else rejected
+
+
+def _epipolar_inliers(xy0: np.ndarray, xy1: np.ndarray, matrix: np.ndarray, max_error: float) -> np.ndarray:
+    """(M,) bool: Sampson error within `max_error`, in the units of the points; points (M, 2), NaN is no inlier."""
+    squared = np.array(pycolmap.compute_squared_sampson_error(xy0, xy1, matrix))
+    return squared <= max_error**2
+
+
+def _planar_inliers(xy0: np.ndarray, xy1: np.ndarray, homography: np.ndarray, max_error_px: float) -> np.ndarray:
+    """(M,) bool: the homography puts the point of image 0 within `max_error_px` of its match; points (M, 2) px."""
+    projected = np.column_stack([xy0, np.ones(len(xy0))]) @ homography.T
+    with np.errstate(divide="ignore", invalid="ignore"):  # points on the horizon are no inliers
+        offset = projected[:, :2] / projected[:, 2:] - xy1
+    return (offset**2).sum(axis=1) <= max_error_px**2
+
+
+def verify_pairs(
+    images: Sequence[ImageRef],
+    pairs: Sequence[ImagePair],
+    read: Callable[[ImagePair], PairMatches],
+    cameras: Mapping[str, pycolmap.Camera],
+    px_per_unit: Mapping[str, float],
+    config: VerificationConfig,
+    quiet: bool = False,
+) -> dict[ImagePair, VerifiedPair]:
+    """verify_pair for many pairs; pairs that are rejected are left out.
+
+    read: gives the matches of a pair. cameras, px_per_unit: by image name; px of the stored image per px of the
+    matching resolution, in which `config` states the error. quiet: no progress bar.
+    """
+    size_wh = {image.name: image.size_wh for image in images}
+    verified = {}
+    for pair in tqdm(pairs, desc="verify", unit="pair", disable=quiet):
+        matches = read(pair)
+        confident = np.flatnonzero(matches.score >= config.min_score)
+        agreeing = verify_pair(
+            matches.select(confident),
+            cameras[pair.name0],
+            cameras[pair.name1],
+            config.max_error_px * max(px_per_unit[pair.name0], px_per_unit[pair.name1]),
+            config.min_inliers,
+            config.min_inlier_ratio,
+        )
+        if is_convincing(np.count_nonzero(agreeing), len(confident), config):
+            inliers = np.zeros(len(matches), dtype=bool)
+            inliers[confident[agreeing]] = True
+            cover0 = measure_cover(matches.xy0[inliers], size_wh[pair.name0])
+            cover1 = measure_cover(matches.xy1[inliers], size_wh[pair.name1])
+            verified[pair] = VerifiedPair(pair, inliers, np.count_nonzero(inliers) * min(cover0, cover1))
+    return verified
+
+
+def is_convincing(inliers: int, matches: int, config: VerificationConfig) -> bool:
+    """Whether so many inliers among so many matches prove that two photos show the same place."""
+    sureness = min(inliers / config.sure_inliers, 1.0)
+    ratio = config.doubtful_inlier_ratio + sureness * (config.min_inlier_ratio - config.doubtful_inlier_ratio)
+    return inliers > 0 and inliers >= ratio * matches
+
+
+def measure_cover(xy: np.ndarray, size_wh: tuple[int, int]) -> float:
+    """Share of the cells of an 8 x 8 division of the image that hold a point. xy: (N, 2) px."""
+    cell = np.clip((xy / np.array(size_wh) * 8).astype(int), 0, 7)
+    return len(np.unique(cell[:, 1] * 8 + cell[:, 0])) / 64
+
+
+def verify_database(
+    path: Path,
+    max_error_px: float,
+    min_inliers: int,
+    min_inlier_ratio: float,
+    seed: int = 0,
+    num_threads: int = -1,
+) -> None:
+    """Estimate the two-view geometry of all matched pairs of a database and store it there, replacing earlier ones.
+
+    max_error_px: px of the stored images. num_threads: -1 takes all cores. Raises InputError where there is no
+    database.
+    """
+    with open_database(path) as database:
+        database.clear_two_view_geometries()  # pycolmap skips pairs that have one
+    verifier = pycolmap.GeometricVerifierOptions(num_threads=num_threads)
+    # Ctrl-C takes effect between batches.
+    pairing = pycolmap.ExistingMatchedPairingOptions(batch_size=4 * (os.cpu_count() or 1))
+    options = _two_view_options(max_error_px, min_inliers, min_inlier_ratio, seed)
+    with quiet_colmap():
+        pycolmap.geometric_verification(path, verifier, pairing, options)

@@ -1,0 +1,217 @@
+"""The result of a run in the formats of other programs, through pycolmap.
+
+| format | what is written |
+|---|---|
+| hloc | a folder: features.h5, matches.h5, pairs.txt, see hm_sfm.formats.hloc |
+| nerfstudio | a folder: undistorted images/, transforms.json, points3D.ply |
+| 3dgs | a folder: undistorted images/, sparse/0 with PINHOLE cameras |
+| ply | a file: the points and their colours |
+| txt | a folder: the model as COLMAP's text files |
+"""
+
+import json
+import logging
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from hm_sfm.io.atomic import make_folder, replace_file
+from hm_sfm.photos.bitmaps import FOREIGN_EXTENSIONS
+from hm_sfm.colmap.models import quiet_colmap, read_model
+from hm_sfm.colmap.database import open_database
+from hm_sfm.errors import InputError
+from hm_sfm.formats.hloc import write_features, write_matches
+from hm_sfm.pairs.selection import read_pairs, write_pairs
+from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
+
+logger = logging.getLogger(__name__)
+
+GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Cameras of OpenGL look along -z with y up, those of COLMAP along z with y down."""
+
+
+def convert_run(out: Path, to: str, target: Path, image_folder: Path | None = None) -> None:
+    """Write the largest model of the run in `out`, or its database for hloc, in the format `to` to `target`.
+
+    target: a new file for ply, a new or empty folder for all others; it appears whole or not at all.
+    image_folder: the photos, if they are no longer where they were in the run.
+
+    Raises InputError where the run has no model or database, where photos are missing or cannot be undistorted, where
+    hloc cannot tell image names apart, and where the target is there already.
+    """
+    out, target = Path(out), Path(target)
+    if to == "ply":
+        convert_to_ply(out, target)
+        return
+    with make_folder(target) as folder:
+        if to == "txt":
+            convert_to_txt(out, folder)
+        elif to == "hloc":
+            convert_to_hloc(out, folder)
+        elif to == "nerfstudio":
+            convert_to_nerfstudio(out, folder, image_folder)
+        else:
+            convert_to_3dgs(out, folder, image_folder)
+
+
+def find_photos(out: Path, image_folder: Path | None) -> Path:
+    """The folder of the photos of a run. Raises InputError where it is not there."""
+    if image_folder is None:
+        try:
+            image_folder = Path(json.loads((out / "summary.json").read_text())["image_folder"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{out / 'summary.json'} does not say where the photos are: name --images") from error
+    if not Path(image_folder).is_dir():
+        raise InputError(f"the folder of photos {image_folder} does not exist: name it with --images")
+    return Path(image_folder)
+
+
+def convert_to_ply(out: Path, target: Path) -> None:
+    """The points of the model with their colours, as a binary PLY file."""
+    model = _read_result(out)
+    if target.exists():
+        raise InputError(f"{target} is there already: name a new file")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(target) as temporary:
+        model.export_PLY(temporary)
+
+
+def convert_to_txt(out: Path, folder: Path) -> None:
+    """COLMAP's text files. Image names with spaces are logged as a warning: COLMAP cannot read them back."""
+    model = _read_result(out)
+    spaced = [image.name for image in model.images.values() if " " in image.name]
+    if spaced:
+        logger.warning("COLMAP cannot read names with spaces from text files, such as %r", min(spaced))
+    model.write_text(folder)
+
+
+def convert_to_hloc(out: Path, folder: Path) -> None:
+    """features.h5 and matches.h5 from the database of a run, and its pairs.txt. hloc scales its limits by 1 px."""
+    with open_database(out / "database.db") as database:
+        rows = sorted(database.read_all_images(), key=lambda row: row.image_id)
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        images, keypoints = [], []
+        for row in rows:
+            camera = cameras[row.camera_id]
+            images.append(ImageRef(row.name, Path(row.name), (camera.width, camera.height)))
+            xy = database.read_keypoints(row.image_id)[:, :2]
+            keypoints.append(Keypoints(row.name, xy, np.ones(len(xy)), np.ones(len(xy))))
+        pair_ids, all_indices = database.read_all_matches()
+    name_of = {row.image_id: row.name for row in rows}
+    matches = []
+    for pair_id, indices in zip(pair_ids, all_indices):
+        names = [name_of[image_id] for image_id in pycolmap.pair_id_to_image_pair(pair_id)]
+        indices = indices if names[0] < names[1] else indices[:, ::-1]
+        matches.append(IndexMatches(ImagePair.of(*names), indices, np.ones(len(indices))))
+    pairs = read_pairs(out / "pairs.txt", list(name_of.values()))
+    write_features(folder / "features.h5", images, keypoints, {image.name: 1.0 for image in images})
+    write_matches(folder / "matches.h5", pairs, keypoints, matches)
+    write_pairs(folder / "pairs.txt", pairs)
+
+
+def convert_to_3dgs(out: Path, folder: Path, image_folder: Path | None) -> None:
+    """Undistorted images and their model with PINHOLE cameras, laid out for Gaussian splatting.
+
+    Its readers take the images from one folder by their last names, so that subfolders become part of the names.
+    """
+    model = undistort_photos(out, folder, image_folder)
+    names = flatten_names([image.name for image in model.images.values()])
+    for image in model.images.values():
+        if names[image.name] != image.name:
+            os.replace(folder / "images" / image.name, folder / "images" / names[image.name])
+            image.name = names[image.name]
+    for path in sorted((folder / "images").rglob("*"), reverse=True):
+        if path.is_dir():
+            path.rmdir()
+    (folder / "sparse" / "0").mkdir(parents=True)
+    model.write_binary(folder / "sparse" / "0")
+
+
+def convert_to_nerfstudio(out: Path, folder: Path, image_folder: Path | None) -> None:
+    """Undistorted images, transforms.json and the points, in the model's own frame of coordinates."""
+    model = undistort_photos(out, folder, image_folder)
+    model.export_PLY(folder / "points3D.ply")
+    transforms = {"camera_model": "PINHOLE", "ply_file_path": "points3D.ply", **describe_frames(model)}
+    (folder / "transforms.json").write_text(json.dumps(transforms, indent=2) + "\n")
+
+
+def describe_frames(model: pycolmap.Reconstruction) -> dict[str, object]:
+    """Cameras and poses of a model of PINHOLE cameras as transforms.json has them, files in images/.
+
+    Intrinsics stand at the top where all images share them, else in each frame; transform_matrix is world_from_cam of
+    a camera as in OpenGL.
+    """
+    frames = []
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        camera = model.cameras[image.camera_id]
+        world_from_cam = np.eye(4)
+        world_from_cam[:3] = image.cam_from_world().inverse().matrix()
+        fx, fy, cx, cy = map(float, camera.params)
+        intrinsics = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": camera.width, "h": camera.height}
+        pose = {"file_path": f"images/{image.name}", "transform_matrix": (world_from_cam @ GL_FROM_CV).tolist()}
+        frames.append((intrinsics, pose))
+    if all(intrinsics == frames[0][0] for intrinsics, _ in frames):
+        return {**frames[0][0], "frames": [pose for _, pose in frames]}
+    return {"frames": [{**intrinsics, **pose} for intrinsics, pose in frames]}
+
+
+def undistort_photos(out: Path, folder: Path, image_folder: Path | None) -> pycolmap.Reconstruction:
+    """Write the undistorted photos of the model to folder/images, and return the model that belongs to them.
+
+    Its cameras are PINHOLE. Raises InputError where a photo is missing or cannot be undistorted.
+    """
+    names = [image.name for image in _read_result(out).images.values()]
+    photos = find_photos(out, image_folder)
+    missing = [name for name in names if not (photos / name).is_file()]
+    if missing:
+        raise InputError(
+            f"{photos} lacks {len(missing)} of {len(names)} photos of the model, for example {missing[0]!r}: name the "
+            "folder of photos with --images"
+        )
+    foreign = [name for name in names if Path(name).suffix.lower() in FOREIGN_EXTENSIONS]
+    if foreign:
+        raise InputError(
+            f"COLMAP cannot undistort HEIC and WebP photos, such as {photos / foreign[0]}: convert the {len(foreign)} "
+            "of them to JPEG and reconstruct again"
+        )
+    # What COLMAP logs are the photos that it cannot read, which are told below.
+    with tempfile.TemporaryDirectory(dir=folder) as temporary, quiet_colmap(pycolmap.logging.FATAL):
+        pycolmap.undistort_images(temporary, out / "sparse" / "0", photos)
+        undistorted = Path(temporary) / "images"
+        written = {path.relative_to(undistorted).as_posix() for path in undistorted.rglob("*")}
+        failed = [name for name in names if name not in written]
+        if failed:
+            raise InputError(f"cannot undistort {len(failed)} of {len(names)} photos, for example {photos / failed[0]}")
+        os.replace(undistorted, folder / "images")
+        model = read_model(Path(temporary) / "sparse")
+    for camera in model.cameras.values():
+        if camera.model == pycolmap.CameraModelId.SIMPLE_PINHOLE:  # undistorted already, so it was left as it is
+            focal, cx, cy = camera.params
+            camera.model = pycolmap.CameraModelId.PINHOLE
+            camera.params = [focal, focal, cx, cy]
+    return model
+
+
+def flatten_names(names: Sequence[str]) -> dict[str, str]:
+    """Names without folders that stay different, also where case does not count: a/b.jpg becomes a_b.jpg."""
+    flat: dict[str, str] = {}
+    taken: set[str] = set()
+    # Names without folders come first: they keep theirs.
+    for name in sorted(names, key=lambda name: ("/" in name, name)):
+        short = name.replace("/", "_")
+        while short.lower() in taken:
+            short = f"_{short}"
+        taken.add(short.lower())
+        flat[name] = short
+    return flat
+
+
+def _read_result(out: Path) -> pycolmap.Reconstruction:
+    folder = out / "sparse" / "0"
+    if not folder.is_dir():
+        raise InputError(f"{out} holds no model (sparse/0): run hm-sfm reconstruct first")
+    return read_model(folder)

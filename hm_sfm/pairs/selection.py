@@ -1,0 +1,259 @@
+"""Stage 2: which images to match with which."""
+
+import itertools
+import logging
+import re
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from hm_sfm.io.atomic import replace_file
+from hm_sfm.colmap.models import quiet_colmap
+from hm_sfm.config import PairConfig
+from hm_sfm.errors import ConfigError, InputError
+from hm_sfm.types import ImagePair
+
+logger = logging.getLogger(__name__)
+
+MODES = ("auto", "exhaustive", "sequential", "retrieval", "spatial")
+MAX_NAMES_LISTED = 20
+LOOP_WINDOWS = 4
+"""A sequence closes a loop where it comes back after more than so many windows."""
+
+Position = tuple[float, float, float]
+"""Latitude and longitude in degrees (WGS84) and altitude in m."""
+FindSimilar = Callable[[Sequence[str], int, int], np.ndarray]
+"""(names, top, gap) -> (N, top) int64: for each name the positions in `names` of the `top` images most like it that
+are more than `gap` places away, best first; -1 where there are no more."""
+
+# One name of a pairs file: in double quotes (a quote inside is doubled), or bare.
+NAME = r'(?:"(?:[^"]|"")*"|[^ \t"][^ \t]*)'
+TWO_NAMES = re.compile(rf"[ \t]*({NAME})[ \t]+({NAME})[ \t]*")
+# What may stand bare: no white space or quote, and no comment or byte-order mark at its start.
+BARE_NAME = re.compile(r'[^\s"#\ufeff][^\s"]*')
+
+
+def select_pairs(
+    names: Sequence[str],
+    config: PairConfig,
+    find_similar: FindSimilar | None = None,
+    positions: Mapping[str, Position] | None = None,
+) -> tuple[ImagePair, ...]:
+    """The pairs to match among the images `names`, as `config.mode` says; each pair once.
+
+    auto takes all pairs of up to `config.exhaustive_limit` images. Of more it takes each image with those most like
+    it, those taken nearest to it, and, where the images are a sequence, its followers: where their names are numbered
+    and most of the next ones are alike. Images without position have no neighbours by position.
+
+    find_similar: asked only where the mode needs to know which images look alike.
+
+    Raises InputError where there are fewer than two images, no pair at all, no positions for the mode spatial, or the
+    pairs file is unusable, ConfigError where the mode or a setting is impossible, ValueError where the mode needs
+    find_similar and there is none.
+    """
+    if len(names) < 2:
+        raise InputError(f"at least 2 images are needed to make a pair, found {len(names)}")
+    for key in ("window", "retrieval_top", "spatial_top"):
+        if getattr(config, key) < 1:
+            raise ConfigError(f"pairs.{key} must be at least 1, found {getattr(config, key)}")
+    if config.mode not in MODES and not Path(config.mode).exists():
+        modes = f"{', '.join(MODES[:-1])} or {MODES[-1]}"
+        raise InputError(f"pairs {config.mode!r} is neither {modes} nor a file that exists")
+    if config.mode not in MODES:
+        return read_pairs(Path(config.mode), names)
+    if config.mode == "exhaustive" or (config.mode == "auto" and len(names) <= config.exhaustive_limit):
+        return pair_exhaustively(names)
+
+    ordered = sorted(names, key=_natural_key)
+    pairs: list[ImagePair] = []
+    if config.mode in ("auto", "retrieval"):
+        pairs += _pair_similar(ordered, find_similar, config.retrieval_top)
+    if config.mode == "auto" and _is_numbered(ordered):
+        followers = _pair_at_distances(ordered, [1])
+        if 2 * len(set(followers).intersection(pairs)) >= len(followers):
+            pairs += _pair_at_distances(ordered, range(1, config.window + 1))
+    if config.mode == "sequential":
+        pairs += pair_sequentially(names, config.window)
+        if config.loop_top:
+            pairs += _pair_similar(ordered, find_similar, config.loop_top, LOOP_WINDOWS * config.window)
+    if config.mode == "spatial" and not positions:
+        raise InputError(f"pairs mode 'spatial' needs photos with a GPS position in EXIF, found none in {len(names)}")
+    if config.mode == "spatial" and len(positions) < len(names):
+        lacking = len(names) - len(positions)
+        logger.warning("%d of %d photos have no GPS position in EXIF: they are in no pair", lacking, len(names))
+    if config.mode in ("auto", "spatial") and positions:
+        pairs += pair_spatially(positions, config.spatial_top, config.spatial_distance_m)
+    if not pairs:
+        raise InputError(f"pairs mode {config.mode!r} finds no pair among {len(names)} images: use another mode")
+    return tuple(dict.fromkeys(pairs))
+
+
+def pair_exhaustively(names: Sequence[str]) -> tuple[ImagePair, ...]:
+    """All pairs of different images, in the order of `names`."""
+    return tuple(ImagePair.of(a, b) for a, b in itertools.combinations(names, 2))
+
+
+def pair_sequentially(names: Sequence[str], window: int) -> tuple[ImagePair, ...]:
+    """Each image with its next `window` images and with those at distances of powers of two beyond.
+
+    The sequence is the natural order of `names`: numbers compare as numbers, img2 before img10.
+
+    Raises ConfigError where window is below 1.
+    """
+    if window < 1:
+        raise ConfigError(f"pairs.window must be at least 1, found {window}")
+    powers = [2**k for k in range(len(names).bit_length()) if 2**k > window]
+    return _pair_at_distances(sorted(names, key=_natural_key), [*range(1, min(window, len(names)) + 1), *powers])
+
+
+def pair_spatially(positions: Mapping[str, Position], top: int, distance_m: float) -> tuple[ImagePair, ...]:
+    """Each image with the `top` images taken nearest to it, none farther away than `distance_m`, by COLMAP.
+
+    positions: latitude and longitude in degrees (WGS84) and altitude in m, which is ignored, by image name.
+    """
+    names = sorted(positions)
+    with tempfile.TemporaryDirectory() as folder, quiet_colmap():
+        with pycolmap.Database.open(Path(folder) / "positions.db") as database:
+            _write_positions(database, names, positions)
+            options = pycolmap.SpatialPairingOptions(
+                max_num_neighbors=top, max_distance=distance_m, ignore_z=True, num_threads=1
+            )
+            found = pycolmap.SpatialPairGenerator(options, database).all_pairs()
+    return tuple(dict.fromkeys(ImagePair.of(names[a - 1], names[b - 1]) for a, b in sorted(found)))
+
+
+def read_pairs(path: Path, names: Sequence[str]) -> tuple[ImagePair, ...]:
+    """Read a pairs file, in the order of its lines: one pair a line, the two names separated by a space or a tab.
+
+    A name with spaces stands in double quotes (a quote inside is doubled), or a single tab separates the names. Blank
+    lines and lines that start with # are ignored.
+
+    Raises InputError, naming file and line, where the file cannot be read, a line does not hold two names, an image
+    is unknown (all unknown ones are listed), paired with itself, or a pair is repeated in either order; and where
+    there is no pair at all.
+    """
+    path = Path(path)
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(f"cannot read the pairs file {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"the pairs file {path} is not UTF-8 text") from error
+
+    known = set(names)
+    unknown: dict[str, int] = {}
+    line_of_pair: dict[ImagePair, int] = {}
+    # Not splitlines(), which also splits at characters that may stand in names.
+    for number, line in enumerate(text.split("\n"), start=1):
+        line = line.removesuffix("\r")
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        where = f"{path}, line {number}"
+        name_a, name_b = _parse_line(line, where)
+        for name in (name_a, name_b):
+            if name not in known:
+                unknown.setdefault(name, number)
+        if name_a == name_b:
+            raise InputError(f"{where}: {name_a!r} is paired with itself")
+        pair = ImagePair.of(name_a, name_b)
+        if pair in line_of_pair:
+            raise InputError(f"{where}: repeats the pair of line {line_of_pair[pair]}, {name_a!r} and {name_b!r}")
+        line_of_pair[pair] = number
+    if unknown:
+        listed = [f"{name!r} (line {number})" for name, number in unknown.items()]
+        rest = f" and {len(listed) - MAX_NAMES_LISTED} more" if len(listed) > MAX_NAMES_LISTED else ""
+        raise InputError(f"{path} names images that are not there: {', '.join(listed[:MAX_NAMES_LISTED])}{rest}")
+    if not line_of_pair:
+        raise InputError(f"the pairs file {path} holds no pair")
+    return tuple(line_of_pair)
+
+
+def write_pairs(path: Path, pairs: Iterable[ImagePair]) -> None:
+    """Write a pairs file that `read_pairs`, and where no name needs quotes also hloc and COLMAP, can read.
+
+    Raises InputError where a name holds a line break.
+    """
+    lines = [f"{_quote(pair.name0)} {_quote(pair.name1)}\n" for pair in pairs]
+    with replace_file(path) as temporary:
+        temporary.write_bytes("".join(lines).encode())
+
+
+def _pair_at_distances(ordered: Sequence[str], distances: Iterable[int]) -> tuple[ImagePair, ...]:
+    distances = tuple(distances)
+    return tuple(
+        ImagePair.of(name, ordered[i + distance])
+        for i, name in enumerate(ordered)
+        for distance in distances
+        if i + distance < len(ordered)
+    )
+
+
+def _pair_similar(
+    ordered: Sequence[str], find_similar: FindSimilar | None, top: int, gap: int = 0
+) -> tuple[ImagePair, ...]:
+    """Each image with the `top` ones most like it: a pair that one of the two proposes is enough."""
+    if find_similar is None:
+        raise ValueError(f"to pair {len(ordered)} images by their looks, select_pairs needs find_similar")
+    found = find_similar(ordered, min(top, len(ordered) - 1), gap)
+    return tuple(
+        dict.fromkeys(
+            ImagePair.of(ordered[i], ordered[j]) for i, row in enumerate(found.tolist()) for j in row if j >= 0
+        )
+    )
+
+
+def _is_numbered(ordered: Sequence[str]) -> bool:
+    """Whether most names differ from the next one in nothing but a number."""
+    keys = [_natural_key(name)[0] for name in ordered]
+    steps = [
+        [(one, other) for one, other in zip(key, after) if one != other] if len(key) == len(after) else []
+        for key, after in itertools.pairwise(keys)
+    ]
+    numbered = [len(step) == 1 and isinstance(step[0][0], int) for step in steps]
+    return 2 * sum(numbered) > len(numbered)
+
+
+def _write_positions(database: pycolmap.Database, names: Sequence[str], positions: Mapping[str, Position]) -> None:
+    """Images 1, 2 ... with their positions, and a camera only because COLMAP wants one."""
+    camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId.SIMPLE_PINHOLE, 1.0, 1, 1)
+    with pycolmap.DatabaseTransaction(database):
+        database.write_camera(camera, use_camera_id=True)
+        for image_id, name in enumerate(names, start=1):
+            image = pycolmap.Image(name=name, camera_id=1, image_id=image_id)
+            database.write_image(image, use_image_id=True)
+            wgs84 = pycolmap.PosePriorCoordinateSystem.WGS84
+            prior = pycolmap.PosePrior(
+                corr_data_id=image.data_id, position=np.array(positions[name]), coordinate_system=wgs84
+            )
+            database.write_pose_prior(prior)
+
+
+def _parse_line(line: str, where: str) -> tuple[str, str]:
+    match = TWO_NAMES.fullmatch(line)
+    parts = match.groups() if match else [part.strip(" ") for part in line.strip().split("\t")]
+    if len(parts) != 2 or not all(parts):
+        raise InputError(
+            f"{where}: expected two names, found {line.strip()[:100]!r}; names with spaces "
+            "need double quotes, or a tab between the two"
+        )
+    return _unquote(parts[0]), _unquote(parts[1])
+
+
+def _quote(name: str) -> str:
+    if "\n" in name or "\r" in name:
+        raise InputError(f"the image name {name!r} holds a line break, which a pairs file cannot")
+    return name if BARE_NAME.fullmatch(name) else '"' + name.replace('"', '""') + '"'
+
+
+def _unquote(text: str) -> str:
+    is_quoted = len(text) >= 2 and text.startswith('"') and text.endswith('"')
+    return text[1:-1].replace('""', '"') if is_quoted else text
+
+
+def _natural_key(name: str) -> tuple[list[str | int], str]:
+    parts: list[str | int] = list(re.split("([0-9]+)", name))
+    parts[1::2] = map(int, parts[1::2])
+    return parts, name

@@ -1,0 +1,255 @@
+"""Stage 1: the photos of a folder, and one photo made ready for the network: grey, upright, reduced.
+
+Photos are read as COLMAP reads them, unrotated. Where EXIF says that a photo is turned it is turned for matching,
+and `PreparedImage.stored_from_scaled` carries the points back. HEIC, which COLMAP cannot read, is upright when decoded.
+"""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+
+from hm_sfm.photos.bitmaps import HEIC_EXTENSIONS, INSTALL_HEIC, can_read_heic, read_bitmap
+from hm_sfm.geometry.frames import rotation_matrix
+from hm_sfm.errors import ConfigError, InputError
+from hm_sfm.types import ImageRef, freeze_array
+
+logger = logging.getLogger(__name__)
+
+EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+MIN_EDGE_PX = 32
+"""The network's coarse cells are 8 px: below this there is nothing to match."""
+
+# Clockwise turn that brings the top of the scene to the top. The mirrored orientations (2, 4, 5, 7) get that turn too,
+# but stay mirrored: points map back the same way, and no camera writes them.
+ROTATION_FROM_EXIF = {1: 0, 2: 0, 3: 180, 4: 180, 5: 90, 6: 90, 7: 270, 8: 270}
+CV_ROTATIONS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
+
+# ANYDEPTH keeps 16 bits. The conversion to grey drops alpha: COLMAP ignores it too, and compositing would draw
+# edges against an invented background.
+CV_FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+
+JPEG_MAGIC = b"\xff\xd8"
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+HEIC_MAGIC = b"ftyp"
+"""After the 4 bytes of a length."""
+PNG_END = b"IEND\xaeB`\x82"
+
+
+@dataclass(frozen=True)
+class ImageList:
+    """The photos of a folder."""
+
+    images: tuple[ImageRef, ...]
+    """Sorted by name."""
+    skipped: tuple[tuple[str, str], ...]
+    """(name, reason) of the files that are named like images but cannot be used, sorted by name."""
+
+
+@dataclass(frozen=True)
+class PreparedImage:
+    """One photo as the network takes it."""
+
+    ref: ImageRef
+    grey: np.ndarray
+    """(H, W) float32 in [0, 1], upright, reduced; read-only."""
+    scaled_wh: tuple[int, int]
+    """(W, H) of `grey`, px."""
+    stored_from_scaled: np.ndarray
+    """(3, 3) float64, affine: px of `grey` -> px of the stored image (COLMAP's frame)."""
+
+    def __post_init__(self) -> None:
+        width, height = self.scaled_wh
+        object.__setattr__(self, "grey", freeze_array(self.grey, np.float32, (height, width), "grey"))
+        object.__setattr__(
+            self, "stored_from_scaled", freeze_array(self.stored_from_scaled, np.float64, (3, 3), "stored_from_scaled")
+        )
+
+
+def list_images(folder: Path) -> ImageList:
+    """List the photos below `folder`, subfolders included, sorted by name; hidden files and folders are ignored.
+
+    A file that is named like an image but is damaged, smaller than 32 px on a side, or unknown to COLMAP is skipped:
+    it is logged as a warning and reported in `skipped`; where the package for HEIC is not installed, HEIC photos are
+    skipped with one warning.
+
+    Raises InputError where the folder does not exist, is not a folder, or holds no usable image.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"the image folder {folder} " + ("is not a folder" if folder.exists() else "does not exist"))
+    relative = [path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir()]
+    names = [path.as_posix() for path in relative if not any(part.startswith(".") for part in path.parts)]
+    kinds = EXTENSIONS + HEIC_EXTENSIONS if can_read_heic() else EXTENSIONS
+    candidates = sorted(name for name in names if Path(name).suffix.lower() in kinds)
+    heic = sorted(name for name in set(names).difference(candidates) if Path(name).suffix.lower() in HEIC_EXTENSIONS)
+    if not candidates and not heic:
+        listed = ", ".join(extension[1:] for extension in kinds)
+        raise InputError(f"the image folder {folder} holds {len(names)} files but no image ({listed})")
+    images = []
+    reason = f"is HEIC, which needs the package pillow-heif: {INSTALL_HEIC}, or convert it to JPEG"
+    skipped = [(name, f"{folder / name} {reason}") for name in heic]
+    if heic:
+        logger.warning("skipped: %s (%d such files)", skipped[0][1], len(heic))
+    for name in candidates:
+        try:
+            images.append(read_ref(folder / name, name))
+        except InputError as error:
+            logger.warning("skipped: %s", error)
+            skipped.append((name, str(error)))
+    if not images:
+        raise InputError(
+            f"the image folder {folder} holds {len(skipped)} images but none can be used, for example: {skipped[0][1]}"
+        )
+    return ImageList(tuple(images), tuple(sorted(skipped)))
+
+
+def read_ref(path: Path, name: str | None = None) -> ImageRef:
+    """Check one image file and read its stored size, EXIF rotation and position.
+
+    `name` defaults to the file's own name.
+
+    Raises InputError where the file cannot be read or decoded, is cut short, or is smaller than 32 px on a side, and
+    MissingPackageError where it needs a package that is not installed.
+    """
+    path = Path(path)
+    name = path.name if name is None else name
+    if not _is_storable(name):
+        raise InputError(f"{str(path)!r} has a line break or bytes that are not UTF-8 in its name")
+    data = _read_bytes(path)
+    bitmap = read_bitmap(path, as_rgb=False)
+    if bitmap is None:
+        if _decode(data) is None:
+            raise InputError(f"{path} cannot be decoded as an image")
+        raise InputError(f"{path} is of a kind that COLMAP cannot read: convert it to JPEG or PNG")
+    if not _is_complete(data):
+        raise InputError(f"{path} is cut short or cannot be decoded")
+    size_wh = (bitmap.width, bitmap.height)
+    _check_size(size_wh, str(path))
+    return ImageRef(name, path, size_wh, ROTATION_FROM_EXIF.get(bitmap.exif_orientation(), 0), _read_gps(bitmap))
+
+
+def _read_gps(bitmap: pycolmap.Bitmap) -> tuple[float, float, float] | None:
+    """ImageRef.gps; None unless EXIF has all of it, as COLMAP does, and where receivers without a fix left zeros."""
+    found = (bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude())
+    if None in found or not np.isfinite(found).all() or found[:2] == (0, 0):
+        return None
+    return found if abs(found[0]) <= 90 and abs(found[1]) <= 180 else None
+
+
+def prepare_image(ref: ImageRef, long_edge_px: int) -> PreparedImage:
+    """Read a photo's pixels, turn them upright and reduce them so that the long edge is at most `long_edge_px`.
+
+    Colour becomes grey, the 16 bits of a PNG are kept, alpha is dropped. Never enlarged, never padded.
+
+    Raises InputError where the file cannot be decoded or has changed size since it was listed, ConfigError where
+    long_edge_px is below 32.
+    """
+    data = _read_bytes(ref.path)
+    if data.startswith((JPEG_MAGIC, PNG_MAGIC)):
+        grey = _decode(data)
+    else:
+        # OpenCV turns a TIFF as its orientation tag says, even when told not to; COLMAP's reader does not.
+        bitmap = read_bitmap(ref.path, as_rgb=False)
+        grey = None if bitmap is None else bitmap.to_array().reshape(bitmap.height, bitmap.width)
+    if grey is None:
+        raise InputError(f"{ref.path} cannot be decoded as an image")
+    found_wh = (grey.shape[1], grey.shape[0])
+    if found_wh != tuple(ref.size_wh):
+        raise InputError(
+            f"{ref.path} is {found_wh[0]} x {found_wh[1]} px but was listed as {ref.size_wh[0]} x {ref.size_wh[1]} px"
+        )
+    return _prepare(ref, grey, long_edge_px)
+
+
+def prepare_array(array: np.ndarray, long_edge_px: int, name: str = "array") -> PreparedImage:
+    """Prepare an image that is already in memory: (H, W) grey or (H, W, 3) RGB, uint8, taken as upright.
+
+    Raises InputError on another shape or dtype or a side below 32 px, ConfigError where long_edge_px is below 32.
+    """
+    array = np.asarray(array)
+    if array.dtype != np.uint8 or not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)):
+        raise InputError(f"{name} must be an (H, W) or (H, W, 3) uint8 array, got {array.shape} {array.dtype}")
+    size_wh = (array.shape[1], array.shape[0])
+    _check_size(size_wh, name)
+    array = np.ascontiguousarray(array)
+    grey = array if array.ndim == 2 else cv2.cvtColor(array, cv2.COLOR_RGB2GRAY)
+    return _prepare(ImageRef(name, Path(name), size_wh), grey, long_edge_px)
+
+
+def _prepare(ref: ImageRef, stored: np.ndarray, long_edge_px: int) -> PreparedImage:
+    """Reduce and turn a stored grey image, (H, W) uint8 or uint16."""
+    if long_edge_px < MIN_EDGE_PX:
+        raise ConfigError(f"images.long_edge_px must be at least {MIN_EDGE_PX}, found {long_edge_px}")
+    scale = min(1.0, long_edge_px / max(ref.size_wh))
+    width, height = ref.size_wh
+    reduced_wh = (max(1, round(width * scale)), max(1, round(height * scale)))
+    reduced = stored if scale == 1.0 else cv2.resize(stored, reduced_wh, interpolation=cv2.INTER_AREA)
+    grey = reduced.astype(np.float32) / np.iinfo(reduced.dtype).max
+    if ref.rotation_deg:
+        grey = cv2.rotate(grey, CV_ROTATIONS[ref.rotation_deg])
+    scaled_wh = (grey.shape[1], grey.shape[0])
+    stored_from_reduced = np.diag([width / reduced_wh[0], height / reduced_wh[1], 1.0])
+    reduced_from_scaled = rotation_matrix(scaled_wh, -ref.rotation_deg % 360)
+    return PreparedImage(ref, grey, scaled_wh, stored_from_reduced @ reduced_from_scaled)
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read the image {path}: {error.strerror}") from error
+
+
+def _decode(data: bytes) -> np.ndarray | None:
+    """The stored pixels, (H, W) grey of the file's own depth, or None."""
+    if not data:
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), CV_FLAGS)
+    except cv2.error:
+        return None
+
+
+def _is_complete(data: bytes) -> bool:
+    """Whether an image file is whole. Bytes after the end of a JPEG or PNG are allowed: phones append videos."""
+    if data.startswith(JPEG_MAGIC):
+        return _has_jpeg_end(data)
+    if data.startswith(PNG_MAGIC):
+        return PNG_END in data
+    if data[4:8] == HEIC_MAGIC:
+        return True  # what is cut short cannot be decoded
+    return _decode(data) is not None
+
+
+def _has_jpeg_end(data: bytes) -> bool:
+    """Whether a JPEG has the end-of-image marker: without it, decoders fill the rest with grey and report success.
+
+    Segments before the scan are stepped over, because a thumbnail in one of them has an end marker of its own. In
+    the scan, the bytes of the marker occur nowhere else.
+    """
+    at = len(JPEG_MAGIC)
+    while (at := data.find(b"\xff", at)) >= 0 and at + 4 <= len(data):
+        marker = data[at + 1]
+        if marker == 0xDA:
+            return data.find(b"\xff\xd9", at) >= 0
+        is_padding = marker == 0xFF
+        at += 1 if is_padding else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return False
+
+
+def _check_size(size_wh: tuple[int, int], what: str) -> None:
+    if min(size_wh) < MIN_EDGE_PX:
+        raise InputError(f"{what} is {size_wh[0]} x {size_wh[1]} px, at least {MIN_EDGE_PX} px a side are needed")
+
+
+def _is_storable(name: str) -> bool:
+    """Whether a pairs file (lines) and a COLMAP database (UTF-8) can hold the name."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return "\n" not in name and "\r" not in name

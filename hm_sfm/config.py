@@ -91,7 +91,7 @@ class MatchingConfig:
     grow_below: int = 300
     """In pairs with fewer good matches, these spread to neighbours that the coarse stage missed; 0 is the paper. Where
     there are enough, grown matches are no gain: they are less exact than those that the coarse stage finds itself."""
-    retry_turned: bool = True
+    try_hypotheses: bool = True
     """Pairs with few good matches are looked at turned by quarters and reduced to 1/2 and 1/3, and matched again where
     that fits clearly better."""
     feature_cache_mb: int = 1500
@@ -121,10 +121,10 @@ class VerificationConfig:
 class KeypointConfig:
     """Persistence. Distances in px of the matching resolution, scaled to each photo."""
 
-    carry_score: float = 0.7
+    propagation_min_score: float = 0.7
     """Patches with a lower score carry no points, but for the best ones of pairs that have few. hm-sfm refine does
     without it: it begins with matches that were verified."""
-    carry_radius_px: float = 8.0
+    propagation_radius_px: float = 8.0
     """A patch carries points no farther than this from its centre."""
     join_radius_px: float = 1.0
     separation_px: float = 2.0
@@ -134,7 +134,7 @@ class KeypointConfig:
     """Of the joint adjustment of each track's keypoints; 0 leaves them where they were first predicted."""
     max_keypoints: int = 8000
     """Per image, longest tracks first, spread over the image."""
-    native_px: int = 1024
+    refine_long_edge_px: int = 1024
     """Long edge of the photos on which a second fine pass places carried keypoints again, at least images.long_edge_px,
     never enlarged; 0 leaves it out. Networks without homographies do without it."""
 

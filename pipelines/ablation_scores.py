@@ -209,7 +209,7 @@ Made by
 
     {command}
 
-Each variant of the fine stage: {config.steps} steps of {config.pairs_per_step} pairs of {config.size_px} px, with the
+Each hypothesis of the fine stage: {config.steps} steps of {config.pairs_per_step} pairs of {config.size_px} px, with the
 features of `{Path(config.start_from).name}`, which go on learning, and a head that starts new. The first table is of
 w/r/K = {net.window}/{net.radius}/{net.iterations}; in the second, homographies are supervised as in the last row of the first, and `expectation` is
 LoFTR's head, which has a centre only to supervise. With spacing 2 every second cell of a patch is looked up each way, a

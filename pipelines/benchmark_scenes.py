@@ -30,7 +30,7 @@ from hm_sfm.errors import HmSfmError, InputError, NoModelError
 from hm_sfm.photos.images import list_images
 from hm_sfm.colmap.mapping import map_incrementally, summarise_models
 from hm_sfm.pairs.selection import select_pairs
-from hm_sfm.pipeline.reconstruction import describe_matching, measure_units, reconstruct
+from hm_sfm.pipeline.reconstruction import describe_matching, measure_px_scales, reconstruct
 from hm_sfm.matching.store import digest_image
 from hm_sfm.types import ImageRef, MappingResult
 from hm_sfm.colmap.verification import verify_database
@@ -77,7 +77,7 @@ def measure_scene(
         verified = count_verified(run / "database.db")
         score = SceneScore(name, method, len(images), result.registered, verified, None, None, *figures, seconds)
     if reference is not None and score.judged is None:
-        max_error_px = config.verification.max_error_px * max(measure_units(images, config).values())
+        max_error_px = config.verification.max_error_px * max(measure_px_scales(images, config).values())
         judged, correct = judge_pairs(run / "database.db", reference, max_error_px)
         score = replace(score, judged=judged, correct=correct)
     write_json(stored, asdict(score))
@@ -95,7 +95,7 @@ def build_model(folder: Path, images: Sequence[ImageRef], method: str, run: Path
     database, checks = run / "database.db", config.verification
     run.mkdir(parents=True, exist_ok=True)
     write_database(database, images, make_cameras(images, config.cameras), keypoints, matches)
-    max_error_px = checks.max_error_px * max(measure_units(images, config).values())
+    max_error_px = checks.max_error_px * max(measure_px_scales(images, config).values())
     verify_database(database, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
     return summarise_models(map_incrementally(database, folder, run / "sparse", config.mapping, False), len(images))
 

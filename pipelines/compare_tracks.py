@@ -20,7 +20,7 @@ from hm_sfm.photos.images import list_images
 from hm_sfm.evaluation.loftr_style import make_keypoints
 from hm_sfm.colmap.mapping import map_incrementally, summarise_models
 from hm_sfm.matching.run import match_pairs
-from hm_sfm.pipeline.reconstruction import carry_keypoints, choose_pairs, claim_folder, describe_matching, measure_units
+from hm_sfm.pipeline.reconstruction import persist_verified, choose_pairs, claim_folder, describe_matching, measure_px_scales
 from hm_sfm.matching.store import MatchStore, digest_image
 from hm_sfm.colmap.verification import verify_database, verify_pairs
 
@@ -32,7 +32,7 @@ def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:
     images = list_images(photos).images
     pairs = choose_pairs(images, out, config)
     cameras = make_cameras(images, config.cameras)
-    px_per_unit = measure_units(images, config)
+    px_scale = measure_px_scales(images, config)
 
     # Each head's matches of the same pairs, stored side by side.
     digests = {image.name: digest_image(image) for image in images}
@@ -44,12 +44,12 @@ def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:
 
     # Three ways from matches to keypoints.
     camera_of = {image.name: cameras.cameras[index] for image, index in zip(images, cameras.camera_index)}
-    verified = verify_pairs(images, pairs, homographies.read, camera_of, px_per_unit, checks)
+    verified = verify_pairs(images, pairs, homographies.read, camera_of, px_scale, checks)
     budget = config.keypoints.max_keypoints
     found = {
-        "persistent": carry_keypoints(images, verified, homographies, config),
-        "raw": make_keypoints(images, pairs, expectations.read, px_per_unit, None, budget),
-        "snapped": make_keypoints(images, pairs, expectations.read, px_per_unit, 1, budget),
+        "persistent": persist_verified(images, verified, homographies, config),
+        "raw": make_keypoints(images, pairs, expectations.read, px_scale, None, budget),
+        "snapped": make_keypoints(images, pairs, expectations.read, px_scale, 1, budget),
     }
 
     # The same verification and mapping for all, and what became of the tracks.
@@ -57,7 +57,7 @@ def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:
         (out / name).mkdir(exist_ok=True)
         database = out / name / "database.db"
         write_database(database, images, cameras, keypoints, matches)
-        max_error_px = checks.max_error_px * max(px_per_unit.values())
+        max_error_px = checks.max_error_px * max(px_scale.values())
         verify_database(database, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
         models = map_incrementally(database, photos, out / name / "sparse", config.mapping, fix_intrinsics=False)
         result = summarise_models(models, len(images))

@@ -19,7 +19,7 @@ from hm_sfm.formats.hloc import read_features, read_matches, write_features, wri
 from hm_sfm.photos.images import list_images
 from hm_sfm.colmap.mapping import map_incrementally, summarise_models
 from hm_sfm.pairs.selection import read_pairs, write_pairs
-from hm_sfm.pipeline.reconstruction import match_photos, measure_units, verify_and_carry
+from hm_sfm.pipeline.reconstruction import match_photos, measure_px_scales, verify_and_propagate
 from hm_sfm.colmap.verification import verify_database
 
 
@@ -34,9 +34,9 @@ def run_hloc_style_steps(photos: Path, out: Path) -> None:
     write_pairs(hloc / "pairs.txt", matched.pairs)
 
     # 2. Features: the keypoints that persist from image to image.
-    keypoints, matches = verify_and_carry(matched, config)
-    px_per_unit = measure_units(matched.images, config)
-    write_features(hloc / "features.h5", matched.images, keypoints, px_per_unit)
+    keypoints, matches = verify_and_propagate(matched, config)
+    px_scale = measure_px_scales(matched.images, config)
+    write_features(hloc / "features.h5", matched.images, keypoints, px_scale)
 
     # 3. Matches, as indices into the features.
     write_matches(hloc / "matches.h5", matched.pairs, keypoints, matches)
@@ -49,7 +49,7 @@ def run_hloc_style_steps(photos: Path, out: Path) -> None:
     print(f"{sum(map(len, keypoints))} keypoints, {sum(map(len, matches))} matches in {len(pairs)} pairs")
     database = hloc / "database.db"
     write_database(database, images, make_cameras(images, config.cameras), keypoints, matches)
-    max_error_px = checks.max_error_px * max(px_per_unit.values())
+    max_error_px = checks.max_error_px * max(px_scale.values())
     verify_database(database, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
     models = map_incrementally(database, photos, hloc / "sparse", config.mapping, fix_intrinsics=False)
 

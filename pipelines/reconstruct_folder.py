@@ -14,7 +14,7 @@ from hm_sfm.photos.images import list_images
 from hm_sfm.colmap.mapping import map_incrementally, summarise_models
 from hm_sfm.matching.run import match_pairs
 from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.pipeline.reconstruction import carry_keypoints, choose_pairs, claim_folder, measure_units, open_store
+from hm_sfm.pipeline.reconstruction import persist_verified, choose_pairs, claim_folder, measure_px_scales, open_store
 from hm_sfm.colmap.verification import verify_database, verify_pairs
 
 
@@ -35,16 +35,16 @@ def reconstruct_folder(photos: Path, out: Path) -> None:
 
     # Only matches that agree with the two-view geometry of their pair may carry keypoints.
     camera_of = {image.name: cameras.cameras[index] for image, index in zip(images, cameras.camera_index)}
-    px_per_unit = measure_units(images, config)
-    verified = verify_pairs(images, pairs, store.read, camera_of, px_per_unit, checks)
+    px_scale = measure_px_scales(images, config)
+    verified = verify_pairs(images, pairs, store.read, camera_of, px_scale, checks)
 
     # Keypoints that persist from image to image, and their matches.
-    keypoints, matches = carry_keypoints(images, verified, store, config)
+    keypoints, matches = persist_verified(images, verified, store, config)
 
     # From here on it is COLMAP.
     database = out / "database.db"
     write_database(database, images, cameras, keypoints, matches)
-    max_error_px = checks.max_error_px * max(px_per_unit.values())
+    max_error_px = checks.max_error_px * max(px_scale.values())
     verify_database(database, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
     models = map_incrementally(database, photos, out / "sparse", config.mapping, fix_intrinsics=False)
 

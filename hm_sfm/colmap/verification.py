@@ -125,13 +125,13 @@ def verify_pairs(
     pairs: Sequence[ImagePair],
     read: Callable[[ImagePair], PairMatches],
     cameras: Mapping[str, pycolmap.Camera],
-    px_per_unit: Mapping[str, float],
+    px_scale: Mapping[str, float],
     config: VerificationConfig,
     quiet: bool = False,
 ) -> dict[ImagePair, VerifiedPair]:
     """verify_pair for many pairs; pairs that are rejected are left out.
 
-    read: gives the matches of a pair. cameras, px_per_unit: by image name; px of the stored image per px of the
+    read: gives the matches of a pair. cameras, px_scale: by image name; px of the stored image per px of the
     matching resolution, in which `config` states the error. quiet: no progress bar.
     """
     size_wh = {image.name: image.size_wh for image in images}
@@ -143,7 +143,7 @@ def verify_pairs(
             matches.select(confident),
             cameras[pair.name0],
             cameras[pair.name1],
-            config.max_error_px * max(px_per_unit[pair.name0], px_per_unit[pair.name1]),
+            config.max_error_px * max(px_scale[pair.name0], px_scale[pair.name1]),
             config.min_inliers,
             config.min_inlier_ratio,
         )

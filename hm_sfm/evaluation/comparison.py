@@ -34,7 +34,7 @@ from hm_sfm.photos.masks import NO_MASKS, MaskedStore, Masks, read_masks
 from hm_sfm.matching.run import match_pairs
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.pairs.selection import write_pairs
-from hm_sfm.pipeline.reconstruction import choose_pairs, claim_folder, describe_matching, measure_units, reconstruct, stopwatch
+from hm_sfm.pipeline.reconstruction import choose_pairs, claim_folder, describe_matching, measure_px_scales, reconstruct, stopwatch
 from hm_sfm.matching.store import MatchStore, digest_image
 from hm_sfm.keypoints.tracks import build_tracks, label_tracks, read_tracks
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, PinholeView, Tracks
@@ -249,9 +249,9 @@ def plan_loftr_style(run: Run, matching: Matching) -> list[Method]:
         def build() -> dict[str, float | None]:
             seconds: dict[str, float | None] = {"match": complete_matches(run, matching)}
             with stopwatch(seconds, "keypoints"):
-                px_per_unit = measure_units(run.images, run.config)
+                px_scale = measure_px_scales(run.images, run.config)
                 read = MaskedStore(matching.store, run.masks).read
-                keypoints, matches = make_keypoints(run.images, run.pairs, read, px_per_unit, cell_px, budget)
+                keypoints, matches = make_keypoints(run.images, run.pairs, read, px_scale, cell_px, budget)
             return map_keypoints(run, name, keypoints, matches, seconds)
 
         return Method(name, [matching.store.made_by, budget], build)
@@ -314,7 +314,7 @@ def map_keypoints(
     checks = run.config.verification
     with stopwatch(seconds, "verify"):
         write_database(database, run.images, run.cameras, keypoints, matches)
-        max_error_px = checks.max_error_px * max(measure_units(run.images, run.config).values())
+        max_error_px = checks.max_error_px * max(measure_px_scales(run.images, run.config).values())
         verify_database(database, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
     with (
         stopwatch(seconds, "map"),

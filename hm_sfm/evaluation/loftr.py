@@ -49,7 +49,7 @@ class LoftrMatcher:
                 "LoFTR's own matches need the package kornia, which is not installed: pip install kornia"
             ) from error
         # LoFTR is compared as it is: photos are not matched again in other ways.
-        self.config, self.images = dataclasses.replace(config, retry_turned=False), images
+        self.config, self.images = dataclasses.replace(config, try_hypotheses=False), images
         self.made_by = {
             "weights": digest_weights(str(checkpoint)),
             "kornia": kornia.__version__,

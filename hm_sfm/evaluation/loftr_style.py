@@ -24,13 +24,13 @@ def make_keypoints(
     images: Sequence[ImageRef],
     pairs: Sequence[ImagePair],
     read: Callable[[ImagePair], PairMatches],
-    px_per_unit: Mapping[str, float],
+    px_scale: Mapping[str, float],
     cell_px: float | None,
     max_keypoints: int,
 ) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
     """Keypoints from matches: raw where cell_px is None, else snapped to cells of that size.
 
-    read: gives the matches of a pair; all are used, best or not, as LoFTR's are. px_per_unit: by image name, px of the
+    read: gives the matches of a pair; all are used, best or not, as LoFTR's are. px_scale: by image name, px of the
     stored image per px of the matching resolution, which is that of cell_px. max_keypoints: per image, of snapped ones.
     Returns the Keypoints of every image, in the order of `images`, none for an image without a match, and the
     IndexMatches of every pair. A keypoint's score is its votes, its sigma_px VOTE_PX.
@@ -47,7 +47,7 @@ def make_keypoints(
     index_of: dict[str, list[np.ndarray]] = {}
     for image in images:
         points, votes = np.concatenate(xy[image.name]), np.concatenate(score[image.name])
-        unit = px_per_unit[image.name]
+        unit = px_scale[image.name]
         if cell_px is None:
             position, votes, index = merge_duplicates(points, votes)
         else:

@@ -224,13 +224,13 @@ def score_homographies(
         features0, size_wh, _ = _encode_short_edge(matcher, path0)
         for number in range(2, 7):
             path1 = _find_image(sequence, number)
-            features1, _, px_per_unit1 = _encode_short_edge(matcher, path1)
+            features1, _, px_scale1 = _encode_short_edge(matcher, path1)
             matches = matcher.match_features(features0, features1)
             truth = homography_from_pixel_index(np.loadtxt(sequence / f"H_1_{number}"))
             if observe is not None:
                 observe(path0, path1, truth, matches)
             counts.append(len(matches))
-            errors.append(_measure_corner_error(matches, truth, size_wh, px_per_unit1))
+            errors.append(_measure_corner_error(matches, truth, size_wh, px_scale1))
     scores = {f"auc_{limit}px": area for limit, area in pose_auc(np.array(errors), CORNER_THRESHOLDS_PX).items()}
     return scores | {"mean_matches": float(np.mean(counts))}
 
@@ -245,23 +245,23 @@ def _find_image(sequence: Path, number: int) -> Path:
 def _encode_short_edge(matcher: HomoMatcher, path: Path) -> tuple[ImageFeatures, tuple[int, int], float]:
     """Features, stored size (w, h) px and stored px per reduced px of an image."""
     ref = read_ref(path)
-    px_per_unit = max(1.0, min(ref.size_wh) / HPATCHES_SHORT_EDGE_PX)
-    features = matcher.encode(prepare_image(ref, round(max(ref.size_wh) / px_per_unit)))
-    return features, ref.size_wh, px_per_unit
+    px_scale = max(1.0, min(ref.size_wh) / HPATCHES_SHORT_EDGE_PX)
+    features = matcher.encode(prepare_image(ref, round(max(ref.size_wh) / px_scale)))
+    return features, ref.size_wh, px_scale
 
 
 def _measure_corner_error(
-    matches: PatchMatches, truth: np.ndarray, size_wh: tuple[int, int], px_per_unit1: float
+    matches: PatchMatches, truth: np.ndarray, size_wh: tuple[int, int], px_scale1: float
 ) -> float:
     """Mean distance of image 0's corners under the estimated and the true homography, px of the reduced image 1."""
     if len(matches) < 4:
         return np.inf
     xy0, xy1 = matches.xy0.astype(np.float64), matches.xy1.astype(np.float64)
-    found, _ = cv2.findHomography(xy0, xy1, cv2.RANSAC, HOMOGRAPHY_ERROR_PX * px_per_unit1)
+    found, _ = cv2.findHomography(xy0, xy1, cv2.RANSAC, HOMOGRAPHY_ERROR_PX * px_scale1)
     if found is None:
         return np.inf
     width, height = size_wh
     corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], dtype=np.float64)
     mapped = [corners @ homography.T for homography in (found, truth)]
     apart = mapped[0][:, :2] / mapped[0][:, 2:] - mapped[1][:, :2] / mapped[1][:, 2:]
-    return float(np.linalg.norm(apart, axis=1).mean() / px_per_unit1)
+    return float(np.linalg.norm(apart, axis=1).mean() / px_scale1)

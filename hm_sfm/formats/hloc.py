@@ -25,11 +25,11 @@ SEPARATORS = ("/", "_")
 
 
 def write_features(
-    path: Path, images: Sequence[ImageRef], keypoints: Sequence[Keypoints], px_per_unit: Mapping[str, float]
+    path: Path, images: Sequence[ImageRef], keypoints: Sequence[Keypoints], px_scale: Mapping[str, float]
 ) -> None:
     """Write features.h5, atomically. keypoints: one per image, in the order of the images.
 
-    px_per_unit: by image name, px of the stored image per px of the matching resolution; it becomes the
+    px_scale: by image name, px of the stored image per px of the matching resolution; it becomes the
     `uncertainty`, which is what hloc scales its error limits with. The keypoints' own standard deviations are in a
     further dataset, `sigma_px`, which hloc ignores. Creates the folder.
     """
@@ -38,7 +38,7 @@ def write_features(
         for image, points in zip(images, keypoints, strict=True):
             group = h5.create_group(image.name)
             group["keypoints"] = pixel_index_from_px(points.xy)
-            group["keypoints"].attrs["uncertainty"] = px_per_unit[image.name]
+            group["keypoints"].attrs["uncertainty"] = px_scale[image.name]
             group["scores"] = points.score
             group["sigma_px"] = points.sigma_px
             group["image_size"] = np.array(image.size_wh)

@@ -1,6 +1,6 @@
 """Joint keypoint adjustment: all predictions of a track's keypoints reconciled by robust least squares.
 
-A keypoint that was carried through several pairs has several predictions of its position, each off by the error of
+A keypoint that was propagated through several pairs has several predictions of its position, each off by the error of
 one homography. Together they pin it down better than any of them.
 """
 
@@ -73,7 +73,7 @@ def adjust_keypoints(
         says = np.concatenate([forward, backward, anchors.xy])
         for axis in range(2):
             mean = (np.bincount(ends, trust * says[:, axis], count) + PRIOR_WEIGHT * xy[:, axis]) / total
-            # Less than a full step: two linked keypoints that both move to the other's wish would swap for ever.
+            # Less than a full step: two graph keypoints that both move to the other's wish would swap for ever.
             moved[:, axis] += STEP * (mean - moved[:, axis])
     squared = trust * np.concatenate([residual, residual, apart]) ** 2
     spread = np.bincount(ends, squared, count) + PRIOR_WEIGHT * ROBUST_SCALE**2

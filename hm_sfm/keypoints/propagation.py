@@ -1,8 +1,8 @@
 """Stage 4: persistent keypoints. Verified patch matches carry each keypoint from image to image.
 
-Pairs are walked strongest first. In a pair every keypoint of the first image that lies in a verified patch is carried
-by that patch's homography into the second; every keypoint of the second that is left over is carried back by the
-inverse; patches that hold no keypoint yet seed one at a well-localised pixel. A carried point joins a keypoint that
+Pairs are walked strongest first. In a pair every keypoint of the first image that lies in a verified patch is propagated
+by that patch's homography into the second; every keypoint of the second that is left over is propagated back by the
+inverse; patches that hold no keypoint yet seed one at a well-localised pixel. A propagated point joins a keypoint that
 is already there, or founds one. Afterwards tracks are formed, adjusted jointly and thinned to the budget.
 
 Coordinates within this module are px of the matching resolution ("units"), or finer ones where a second fine pass
@@ -17,7 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 from hm_sfm.keypoints.adjustment import Anchors, adjust_keypoints, measure_residuals, weigh_scores
-from hm_sfm.keypoints.selection import choose_budget
+from hm_sfm.keypoints.selection import select_keypoints
 from hm_sfm.config import KeypointConfig
 from hm_sfm.geometry.frames import px_from_pixel_index
 from hm_sfm.photos.images import PreparedImage
@@ -26,10 +26,10 @@ from hm_sfm.keypoints.tracks import label_tracks, measure_lengths
 from hm_sfm.types import ImagePair, IndexMatches, Keypoints, PairMatches, apply_homographies
 
 SEED_CELL_PX = 8
-CARRYING = 100
+MIN_PROPAGATING = 100
 """Matches of a pair that carry keypoints, however good they are."""
 AGREEMENT_PX = 0.5
-"""Distance from the mean at which a patch's say on a carried point counts half."""
+"""Distance from the mean at which a patch's say on a propagated point counts half."""
 AGREEMENT_ROUNDS = 3
 ANCHOR_PX = 1.0
 """How far from an exact seed a keypoint may be founded that is meant to be the same point."""
@@ -44,7 +44,7 @@ class Photo:
     name: str
     size_wh: tuple[int, int]
     """Px of the stored image."""
-    px_per_unit: float
+    px_scale: float
     """Px of the stored image per unit."""
     seeds: np.ndarray
     """(N, 2) px of the stored image: well-localised points, best first."""
@@ -57,19 +57,19 @@ class Photo:
 
     def allows(self, xy: np.ndarray) -> np.ndarray:
         """(N,) bool: whether keypoints may lie at xy, (N, 2) units: within the image and not masked."""
-        inside = np.all((xy >= 0) & (xy < np.array(self.size_wh) / self.px_per_unit), axis=1)
+        inside = np.all((xy >= 0) & (xy < np.array(self.size_wh) / self.px_scale), axis=1)
         if self.hides:
             # Rounded as Keypoints are: the edge of a mask must not lie between.
-            inside[inside] = ~self.hides((xy[inside] * self.px_per_unit).astype(np.float32))
+            inside[inside] = ~self.hides((xy[inside] * self.px_scale).astype(np.float32))
         return inside
 
 
 @dataclass(frozen=True)
-class Carrier:
+class PatchTransfer:
     """The verified patches of a pair in one direction, in units."""
 
     centre: np.ndarray
-    """(P, 2) in the image that points are carried from."""
+    """(P, 2) in the image that points are propagated from."""
     homography: np.ndarray
     """(P, 3, 3)."""
     score: np.ndarray
@@ -77,8 +77,8 @@ class Carrier:
 
 
 @dataclass(frozen=True)
-class Carried:
-    """Points that a Carrier could place in the other image."""
+class PropagatedPoints:
+    """Points that a PatchTransfer could place in the other image."""
 
     point: np.ndarray
     """(C,) int64: which of the given points."""
@@ -91,13 +91,13 @@ class Carried:
     score: np.ndarray
     """(C,)."""
 
-    def select(self, chosen: np.ndarray) -> "Carried":
+    def select(self, chosen: np.ndarray) -> "PropagatedPoints":
         """Those that `chosen`, (C,) bool, names."""
-        return Carried(*(getattr(self, field.name)[chosen] for field in fields(self)))
+        return PropagatedPoints(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 @dataclass(frozen=True)
-class Links:
+class TrackEdges:
     """Predictions between the keypoints of two images: target[e] from source[e]."""
 
     source_image: int
@@ -105,22 +105,22 @@ class Links:
     source: np.ndarray
     target: np.ndarray
     """(E,) int64, indices into the two images' keypoints."""
-    carried: Carried
+    propagated: PropagatedPoints
 
-    def select(self, chosen: np.ndarray) -> "Links":
+    def select(self, chosen: np.ndarray) -> "TrackEdges":
         """Those that `chosen`, (E,) bool, names."""
         ends = {"source": self.source[chosen], "target": self.target[chosen]}
-        return replace(self, **ends, carried=self.carried.select(chosen))
+        return replace(self, **ends, propagated=self.propagated.select(chosen))
 
 
 @dataclass(frozen=True)
-class LinkedKeypoints:
+class KeypointGraph:
     """All keypoints, and what was predicted of them: tracks in the making."""
 
     photos: tuple[Photo, ...]
     xy: tuple[np.ndarray, ...]
     """By photo, (K, 2) units."""
-    links: tuple[Links, ...]
+    links: tuple[TrackEdges, ...]
 
 
 @dataclass(frozen=True)
@@ -158,10 +158,10 @@ class GrowingKeypoints:
         self.xy = np.concatenate([self.xy, xy])
         return np.arange(first, len(self.xy))
 
-    def settle(self, carried: Carried) -> np.ndarray:
-        """The keypoints that carried points end at (C,) int64: joined ones, or new ones that they found."""
-        target = carried.target.copy()
-        target[target < 0] = self.append(carried.predicted[target < 0])
+    def settle(self, propagated: PropagatedPoints) -> np.ndarray:
+        """The keypoints that propagated points end at (C,) int64: joined ones, or new ones that they found."""
+        target = propagated.target.copy()
+        target[target < 0] = self.append(propagated.predicted[target < 0])
         return target
 
 
@@ -202,26 +202,26 @@ def choose_good(score: np.ndarray, least_score: float, at_least: int) -> np.ndar
     return good
 
 
-def make_carriers(matches: PairMatches, px_per_unit0: float, px_per_unit1: float) -> tuple[Carrier, Carrier]:
-    """The carriers of verified matches, from image 0 to image 1 and back."""
-    scale0, scale1 = np.diag([px_per_unit0, px_per_unit0, 1.0]), np.diag([px_per_unit1, px_per_unit1, 1.0])
+def make_transfers(matches: PairMatches, px_scale0: float, px_scale1: float) -> tuple[PatchTransfer, PatchTransfer]:
+    """The transfers of verified matches, from image 0 to image 1 and back."""
+    scale0, scale1 = np.diag([px_scale0, px_scale0, 1.0]), np.diag([px_scale1, px_scale1, 1.0])
     forward = np.linalg.inv(scale1) @ matches.homography.astype(np.float64) @ scale0
-    centre0, centre1 = matches.xy0 / px_per_unit0, matches.xy1 / px_per_unit1
-    return Carrier(centre0, forward, matches.score), Carrier(centre1, np.linalg.inv(forward), matches.score)
+    centre0, centre1 = matches.xy0 / px_scale0, matches.xy1 / px_scale1
+    return PatchTransfer(centre0, forward, matches.score), PatchTransfer(centre1, np.linalg.inv(forward), matches.score)
 
 
-def carry_points(
-    xy: np.ndarray, carrier: Carrier, there_xy: np.ndarray, free: np.ndarray, there: Photo, config: KeypointConfig,
-) -> Carried:  # fmt: skip
+def propagate_points(
+    xy: np.ndarray, transfer: PatchTransfer, there_xy: np.ndarray, free: np.ndarray, there: Photo, config: KeypointConfig,
+) -> PropagatedPoints:  # fmt: skip
     """Place points of one image in the other, one to one with what is there.
 
-    xy: (N, 2) units; there_xy: (K, 2) keypoints of the other image, free (K,) bool: not yet linked in this pair;
-    there: the other image. A point is carried by the patches within carry_radius_px. It joins the free keypoint
+    xy: (N, 2) units; there_xy: (K, 2) keypoints of the other image, free (K,) bool: not yet graph in this pair;
+    there: the other image. A point is propagated by the patches within propagation_radius_px. It joins the free keypoint
     within join_radius_px where each is the other's nearest; it founds a keypoint where none lies within
     separation_px, free or not, nor a better-scored founder; otherwise, and outside of the image and in its masked
     pixels, it is dropped.
     """
-    point, predicted, jacobian, score = predict_points(xy, carrier, config.carry_radius_px)
+    point, predicted, jacobian, score = transfer_points(xy, transfer, config.propagation_radius_px)
     inside = there.allows(predicted)
     point, predicted, jacobian, score = point[inside], predicted[inside], jacobian[inside], score[inside]
 
@@ -238,22 +238,22 @@ def carry_points(
     founds = founds[thin_points(predicted[founds], config.separation_px)]
     kept = np.sort(np.concatenate([np.flatnonzero(joins), founds]))
     target = np.where(joins[kept], nearest[kept], -1)
-    return Carried(point[kept], target, predicted[kept], jacobian[kept], score[kept])
+    return PropagatedPoints(point[kept], target, predicted[kept], jacobian[kept], score[kept])
 
 
-def predict_points(
-    xy: np.ndarray, carrier: Carrier, radius: float
+def transfer_points(
+    xy: np.ndarray, transfer: PatchTransfer, radius: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Where the patches within `radius` put points: the robust mean of what they say, near patches counting more.
 
     xy: (N, 2) units. Returns point (C,) int64, the points that any patch covers and whose patches agree, predicted
     (C, 2), jacobian (C, 2, 2) and score (C,): the patches' mean score times the share of them that agrees.
     """
-    at, patch, distance = find_pairs_within(xy, carrier.centre, radius)
+    at, patch, distance = find_pairs_within(xy, transfer.centre, radius)
     point, slot = np.unique(at, return_inverse=True)
-    homography = carrier.homography[patch]
+    homography = transfer.homography[patch]
     says = apply_homographies(homography, xy[at]).astype(np.float64)
-    prior = weigh_scores(carrier.score[patch]) * (1.05 - distance / radius)
+    prior = weigh_scores(transfer.score[patch]) * (1.05 - distance / radius)
     trust = prior
     for _ in range(AGREEMENT_ROUNDS):
         predicted = mean_in_groups(says, slot, trust, len(point))
@@ -261,7 +261,7 @@ def predict_points(
         trust = prior / (1 + (apart / AGREEMENT_PX) ** 2)
     jacobian = mean_in_groups(differentiate(homography, xy[at]).reshape(-1, 4), slot, trust, len(point))
     share = np.bincount(slot, trust, len(point)) / np.bincount(slot, prior, len(point))
-    score = mean_in_groups(carrier.score[patch][:, None], slot, prior, len(point))[:, 0] * share
+    score = mean_in_groups(transfer.score[patch][:, None], slot, prior, len(point))[:, 0] * share
     agreed = share >= LEAST_AGREEMENT
     return point[agreed], predicted[agreed], jacobian.reshape(-1, 2, 2)[agreed], score[agreed]
 
@@ -288,20 +288,20 @@ def persist_keypoints(
     config: KeypointConfig,
     quiet: bool = False,
 ) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
-    """Carry keypoints through all pairs, form tracks, adjust them and thin them out: link_keypoints, finish_keypoints.
+    """Carry keypoints through all pairs, form tracks, adjust them and thin them out: propagate_keypoints, finish_keypoints.
 
     Returns the Keypoints of every image, and the IndexMatches of every pair that shares tracks.
     """
-    return finish_keypoints(link_keypoints(photos, ranked_pairs, read_verified, config, quiet), config)
+    return finish_keypoints(propagate_keypoints(photos, ranked_pairs, read_verified, config, quiet), config)
 
 
-def link_keypoints(
+def propagate_keypoints(
     photos: Sequence[Photo],
     ranked_pairs: Sequence[ImagePair],
     read_verified: Callable[[ImagePair], PairMatches],
     config: KeypointConfig,
     quiet: bool = False,
-) -> LinkedKeypoints:
+) -> KeypointGraph:
     """Seed keypoints and carry them through all pairs.
 
     photos: in the order of the result; ranked_pairs: strongest first, the first image of a pair (the one that
@@ -312,67 +312,67 @@ def link_keypoints(
     growing = [GrowingKeypoints() for _ in photos]
     seeds = []
     for photo in photos:
-        units = photo.seeds / photo.px_per_unit
+        units = photo.seeds / photo.px_scale
         units = units[photo.allows(units)]
         seeds.append(units[thin_points(units, config.separation_px)])
     strength = np.zeros(len(photos))
     for place, pair in enumerate(ranked_pairs):
         strength[[index_of[pair.name0], index_of[pair.name1]]] += len(ranked_pairs) - place
-    links: list[Links] = []
+    links: list[TrackEdges] = []
     for pair in tqdm(ranked_pairs, desc="keypoints", unit="pair", disable=quiet):
         ends = index_of[pair.name0], index_of[pair.name1]
         matches = read_verified(pair)
         # Exact seeds are few, and matches of them sure.
-        least_score = 0.0 if photos[ends[0]].seeds_are_exact else config.carry_score
-        matches = matches.select(choose_good(matches.score, least_score, CARRYING))
-        carriers = make_carriers(matches, *(photos[i].px_per_unit for i in ends))
+        least_score = 0.0 if photos[ends[0]].seeds_are_exact else config.propagation_min_score
+        matches = matches.select(choose_good(matches.score, least_score, MIN_PROPAGATING))
+        transfers = make_transfers(matches, *(photos[i].px_scale for i in ends))
         turn = strength[ends[1]] > strength[ends[0]]
         first, second = ends[::-1] if turn else ends
-        links += walk_pair(first, second, carriers[::-1] if turn else carriers, photos, growing, seeds[first], config)
-    return LinkedKeypoints(tuple(photos), tuple(keypoints.xy for keypoints in growing), tuple(links))
+        links += propagate_pair(first, second, transfers[::-1] if turn else transfers, photos, growing, seeds[first], config)
+    return KeypointGraph(tuple(photos), tuple(keypoints.xy for keypoints in growing), tuple(links))
 
 
-def walk_pair(
-    first: int, second: int, carriers: tuple[Carrier, Carrier], photos: Sequence[Photo],
+def propagate_pair(
+    first: int, second: int, transfers: tuple[PatchTransfer, PatchTransfer], photos: Sequence[Photo],
     growing: list[GrowingKeypoints], seeds: np.ndarray, config: KeypointConfig,
-) -> list[Links]:  # fmt: skip
+) -> list[TrackEdges]:  # fmt: skip
     """Carry the keypoints of `first` into `second`, those left over in `second` back, then seed; grows both."""
     here, there = growing[first], growing[second]
 
     old_there = len(there.xy)
-    onward = carry_points(here.xy, carriers[0], there.xy, np.ones(old_there, bool), photos[second], config)
-    onward_links = Links(first, second, onward.point, there.settle(onward), onward)
+    onward = propagate_points(here.xy, transfers[0], there.xy, np.ones(old_there, bool), photos[second], config)
+    onward_links = TrackEdges(first, second, onward.point, there.settle(onward), onward)
 
     free_here = np.ones(len(here.xy), bool)
     free_here[onward_links.source] = False
     left = np.setdiff1d(np.arange(old_there), onward_links.target)
-    back = carry_points(there.xy[left], carriers[1], here.xy, free_here, photos[first], config)
-    back_links = Links(second, first, left[back.point], here.settle(back), back)
+    back = propagate_points(there.xy[left], transfers[1], here.xy, free_here, photos[first], config)
+    back_links = TrackEdges(second, first, left[back.point], here.settle(back), back)
 
     covered, _ = find_nearest(seeds, here.xy, config.seed_spacing_px)
     fresh = seeds[covered < 0]
-    # A seed in first founds its partner in second; one that would join has a neighbour that was carried back.
+    # A seed in first founds its partner in second; one that would join has a neighbour that was propagated back.
     no_partner = np.zeros(len(there.xy), bool)
-    seeded = carry_points(fresh, carriers[0], there.xy, no_partner, photos[second], config)
-    seed_links = Links(first, second, here.append(fresh[seeded.point]), there.settle(seeded), seeded)
+    seeded = propagate_points(fresh, transfers[0], there.xy, no_partner, photos[second], config)
+    seed_links = TrackEdges(first, second, here.append(fresh[seeded.point]), there.settle(seeded), seeded)
     return [onward_links, back_links, seed_links]
 
 
 def finish_keypoints(
-    linked: LinkedKeypoints, config: KeypointConfig
+    graph: KeypointGraph, config: KeypointConfig
 ) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
     """From links to consistent tracks, adjusted positions, and the keypoints that the budget keeps.
 
     Returns the Keypoints of every image, and the IndexMatches of every pair that shares tracks.
     """
-    photos, tracks = linked.photos, settle_tracks(linked, config)
+    photos, tracks = graph.photos, settle_tracks(graph, config)
     image, kept = tracks.image, tracks.kept
     length = measure_lengths(tracks.label)
     keypoints = []
     for i, photo in enumerate(photos):
         mine = kept & (image == i)
         quality = (length[mine] / len(photos)).clip(0, 1)
-        xy, sigma = tracks.xy[mine] * photo.px_per_unit, tracks.sigma[mine] * photo.px_per_unit
+        xy, sigma = tracks.xy[mine] * photo.px_scale, tracks.sigma[mine] * photo.px_scale
         keypoints.append(Keypoints(photo.name, xy, sigma, quality))
     kept_start = np.concatenate([[0], np.cumsum(np.bincount(image[kept], minlength=len(photos)))])
     index = np.cumsum(kept) - 1 - kept_start[image]
@@ -381,30 +381,30 @@ def finish_keypoints(
     return tuple(keypoints), matches
 
 
-def thin_links(linked: LinkedKeypoints, config: KeypointConfig) -> LinkedKeypoints:
+def prune_edges(graph: KeypointGraph, config: KeypointConfig) -> KeypointGraph:
     """The links alone that finish_keypoints would make matches of; all keypoints stay, with or without links."""
-    used = settle_tracks(linked, config).used
-    ends = np.cumsum([len(links.source) for links in linked.links])
+    used = settle_tracks(graph, config).used
+    ends = np.cumsum([len(links.source) for links in graph.links])
     links = [
         links.select(of_links)
-        for links, of_links in zip(linked.links, np.split(used, ends[:-1]) if linked.links else ())
+        for links, of_links in zip(graph.links, np.split(used, ends[:-1]) if graph.links else ())
         if of_links.any()
     ]
-    return replace(linked, links=tuple(links))
+    return replace(graph, links=tuple(links))
 
 
-def settle_tracks(linked: LinkedKeypoints, config: KeypointConfig) -> SettledTracks:
+def settle_tracks(graph: KeypointGraph, config: KeypointConfig) -> SettledTracks:
     """Form tracks, adjust them jointly, give up the links that disagree then, and choose the keypoints to keep."""
-    photos, links = linked.photos, linked.links
-    counts = [len(xy) for xy in linked.xy]
+    photos, links = graph.photos, graph.links
+    counts = [len(xy) for xy in graph.xy]
     start = np.concatenate([[0], np.cumsum(counts)])
     image = np.repeat(np.arange(len(photos)), counts)
-    xy = np.concatenate([np.zeros((0, 2)), *linked.xy])
+    xy = np.concatenate([np.zeros((0, 2)), *graph.xy])
     source = np.concatenate([np.zeros(0, np.int64)] + [start[link.source_image] + link.source for link in links])
     target = np.concatenate([np.zeros(0, np.int64)] + [start[link.target_image] + link.target for link in links])
-    predicted = np.concatenate([np.zeros((0, 2))] + [link.carried.predicted for link in links])
-    jacobian = np.concatenate([np.zeros((0, 2, 2))] + [link.carried.jacobian for link in links])
-    score = np.concatenate([np.zeros(0)] + [link.carried.score for link in links]).astype(np.float64)
+    predicted = np.concatenate([np.zeros((0, 2))] + [link.propagated.predicted for link in links])
+    jacobian = np.concatenate([np.zeros((0, 2, 2))] + [link.propagated.jacobian for link in links])
+    score = np.concatenate([np.zeros(0)] + [link.propagated.score for link in links]).astype(np.float64)
 
     label = label_tracks(len(xy), source, target, score, image)
     same = label[source] == label[target]
@@ -416,7 +416,7 @@ def settle_tracks(linked: LinkedKeypoints, config: KeypointConfig) -> SettledTra
         jacobian[same],
         weigh_scores(score[same]),
         config.adjustment_rounds,
-        find_anchors(photos, linked.xy),
+        find_anchors(photos, graph.xy),
     )
     residual = measure_residuals(xy, moved, source, target, predicted, jacobian)
     finer = np.repeat([photo.finer for photo in photos], counts)
@@ -428,7 +428,7 @@ def settle_tracks(linked: LinkedKeypoints, config: KeypointConfig) -> SettledTra
     length = measure_lengths(label)
     kept = inside & (length >= 2)
     spread = moved[kept] / finer[kept, None]
-    kept[kept] = choose_budget(label[kept], length[kept], sigma[kept], spread, image[kept], config.max_keypoints)
+    kept[kept] = select_keypoints(label[kept], length[kept], sigma[kept], spread, image[kept], config.max_keypoints)
     used = agreed & (label[source] == label[target]) & kept[source] & kept[target]
     return SettledTracks(image, label, moved, sigma, kept, source, target, score, used)
 
@@ -441,7 +441,7 @@ def find_anchors(photos: Sequence[Photo], xy: Sequence[np.ndarray]) -> Anchors:
     keypoint, places, first = [np.zeros(0, np.int64)], [np.zeros((0, 2))], 0
     for photo, points in zip(photos, xy):
         if photo.seeds_are_exact:
-            seeds = photo.seeds / photo.px_per_unit
+            seeds = photo.seeds / photo.px_scale
             nearest, _ = find_nearest(points, seeds, ANCHOR_PX * photo.finer)
             back, _ = find_nearest(seeds, points, ANCHOR_PX * photo.finer)
             held = np.flatnonzero(np.append(back, -1)[nearest] == np.arange(len(points)))
@@ -455,7 +455,7 @@ def group_matches(
     photos: Sequence[Photo], image: np.ndarray, index: np.ndarray, source: np.ndarray, target: np.ndarray,
     score: np.ndarray,
 ) -> tuple[IndexMatches, ...]:  # fmt: skip
-    """Links between kept keypoints as IndexMatches per pair of images, each match once."""
+    """TrackEdges between kept keypoints as IndexMatches per pair of images, each match once."""
     names = np.array([photo.name for photo in photos], dtype=object)
     swap = np.array([names[a] > names[b] for a, b in zip(image[source], image[target])], dtype=bool)
     low, high = np.where(swap, target, source), np.where(swap, source, target)

@@ -1,8 +1,8 @@
-"""Keypoints placed a second time: a fine pass over what was carried, each keypoint in the middle of a patch of its own.
+"""Keypoints placed a second time: a fine pass over what was propagated, each keypoint in the middle of a patch of its own.
 
-Patches carry the keypoints around their centres. What was carried is placed again by a patch around the keypoint itself,
+Patches carry the keypoints around their centres. What was propagated is placed again by a patch around the keypoint itself,
 starting from what the first homographies say, which is more exact; links that this does not confirm are given up. The
-second pass looks at photos of keypoints.native_px, which may be larger than those that were matched: it is as exact as
+second pass looks at photos of keypoints.refine_long_edge_px, which may be larger than those that were matched: it is as exact as
 matching at that size, without its cost.
 """
 
@@ -23,7 +23,7 @@ from tqdm import tqdm
 from hm_sfm.io.batches import store_in_batches
 from hm_sfm.errors import ConfigError, StaleResultError
 from hm_sfm.photos.images import PreparedImage, prepare_image
-from hm_sfm.keypoints.propagation import LinkedKeypoints, Links, Photo, choose_good, differentiate
+from hm_sfm.keypoints.propagation import KeypointGraph, TrackEdges, Photo, choose_good, differentiate
 from hm_sfm.network.fine import FineMap, HomographyHead, make_fine_map
 from hm_sfm.network.homography import is_regular
 from hm_sfm.matching.matcher import (
@@ -39,7 +39,7 @@ from hm_sfm.matching.matcher import (
 from hm_sfm.matching.order import order_pairs
 from hm_sfm.matching.store import MatchStore
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
-from hm_sfm.matching.hypotheses import UPRIGHT, Variant, show_image
+from hm_sfm.matching.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
 
 STRIP_PX = 1024
 """Large photos are encoded in strips of so many rows, to bound the memory,"""
@@ -52,27 +52,27 @@ FARTHEST = 0.7
 LEAST_SCORE = 0.1
 """Predictions of a lower score stay as the first pass made them."""
 CONFIRMING_SCORE = 0.7
-"""Links of a lower score, or moved too far, are given up"""
-LEAST_LINKS = 300
+"""TrackEdges of a lower score, or moved too far, are given up"""
+MIN_EDGES = 300
 """where their pair has so many better ones."""
 
 
 @dataclass(frozen=True)
-class NativeFeatures:
+class RefinementFeatures:
     """Fine features of a photo at its native resolution."""
 
     fine: FineMap
     stored_from_scaled: np.ndarray
     """(3, 3) float64: px of the network's input -> px of the stored image."""
-    reduction: float = 1
-    """See Variant."""
+    downscale: float = 1
+    """See Hypothesis."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """A pair's carried keypoints where the first pass put them, from the first photo of the pair to the second.
+    """A pair's propagated keypoints where the first pass put them, from the first photo of the pair to the second.
 
-    Several Links of the pair one after another; px of the stored images.
+    Several TrackEdges of the pair one after another; px of the stored images.
     """
 
     xy0: np.ndarray
@@ -87,71 +87,71 @@ class Placement:
         return Placement(self.xy0[chosen], self.xy1[chosen], self.linear[chosen])
 
 
-def sharpen_links(
-    linked: LinkedKeypoints,
+def refine_keypoints(
+    graph: KeypointGraph,
     images: Sequence[ImageRef],
     matcher: HomoMatcher,
-    native_px: int,
+    refine_long_edge_px: int,
     store_path: Path,
     made_by: Mapping[str, Any],
     digests: Mapping[str, str],
     quiet: bool = False,
-) -> LinkedKeypoints:
-    """All links as a second fine pass predicts them, in px of photos of `native_px` along their longer sides.
+) -> KeypointGraph:
+    """All links as a second fine pass predicts them, in px of photos of `refine_long_edge_px` along their longer sides.
 
-    images: the photos of `linked`, in its order. store_path: keeps what is done, pair by pair; an interrupted run goes
+    images: the photos of `graph`, in its order. store_path: keeps what is done, pair by pair; an interrupted run goes
     on from there. made_by, digests: the settings and the photos that the links depend on, see MatchStore.
 
-    Links that the second pass does not confirm are given up, but for the best ones of pairs that have few; these stay as
+    TrackEdges that the second pass does not confirm are given up, but for the best ones of pairs that have few; these stay as
     they are, and count less. Raises ConfigError where the network has no homography head, and what MatchStore.write and
     prepare_image raise.
     """
     if not isinstance(matcher.net.head, HomographyHead):
-        raise ConfigError("keypoints.native_px needs network.head homography, found expectation")
+        raise ConfigError("keypoints.refine_long_edge_px needs network.head homography, found expectation")
     members: dict[ImagePair, list[int]] = {}
-    for at, links in enumerate(linked.links):
-        names = sorted(linked.photos[i].name for i in (links.source_image, links.target_image))
+    for at, links in enumerate(graph.links):
+        names = sorted(graph.photos[i].name for i in (links.source_image, links.target_image))
         members.setdefault(ImagePair(*names), []).append(at)
 
     def place(pair: ImagePair) -> Placement:
-        return place_links(linked, pair, members[pair])
+        return locate_edges(graph, pair, members[pair])
 
-    store = open_native_store(store_path, map(place, members), made_by, digests)
-    place_again(tuple(members), place, images, matcher, store, native_px, quiet)
+    store = open_refinement_store(store_path, map(place, members), made_by, digests)
+    refine_pairs(tuple(members), place, images, matcher, store, refine_long_edge_px, quiet)
 
-    native = tuple(refine_units(photo, image, native_px) for photo, image in zip(linked.photos, images, strict=True))
-    sharpened = list(linked.links)
+    native = tuple(refine_px_scale(photo, image, refine_long_edge_px) for photo, image in zip(graph.photos, images, strict=True))
+    sharpened = list(graph.links)
     for pair, numbers in members.items():
         placement, found, first, updated = place(pair), store.read(pair), 0, []
         for at in numbers:
-            links = linked.links[at]
+            links = graph.links[at]
             these = slice(first, first + len(links.source))
-            onward = linked.photos[links.source_image].name == pair.name0
-            updated.append(update_links(links, native, onward, placement.select(these), found.select(these)))
+            onward = graph.photos[links.source_image].name == pair.name0
+            updated.append(update_edges(links, native, onward, placement.select(these), found.select(these)))
             first = these.stop
-        kept = choose_good(np.concatenate([sure for _, sure in updated]), CONFIRMING_SCORE, LEAST_LINKS)
+        kept = choose_good(np.concatenate([sure for _, sure in updated]), CONFIRMING_SCORE, MIN_EDGES)
         ends = np.cumsum([len(sure) for _, sure in updated])[:-1]
         for at, (links, _), of_links in zip(numbers, updated, np.split(kept, ends)):
             sharpened[at] = links.select(of_links)
-    xy = tuple(xy * photo.finer for xy, photo in zip(linked.xy, native))
-    return LinkedKeypoints(native, xy, tuple(sharpened))
+    xy = tuple(xy * photo.finer for xy, photo in zip(graph.xy, native))
+    return KeypointGraph(native, xy, tuple(sharpened))
 
 
-def refine_units(photo: Photo, image: ImageRef, native_px: int) -> Photo:
+def refine_px_scale(photo: Photo, image: ImageRef, refine_long_edge_px: int) -> Photo:
     """The same photo in px of the native resolution, or of the matching resolution where that is no coarser."""
-    px_per_unit = min(photo.px_per_unit, max(1.0, max(image.size_wh) / native_px))
-    return dataclasses.replace(photo, px_per_unit=px_per_unit, finer=photo.px_per_unit / px_per_unit)
+    px_scale = min(photo.px_scale, max(1.0, max(image.size_wh) / refine_long_edge_px))
+    return dataclasses.replace(photo, px_scale=px_scale, finer=photo.px_scale / px_scale)
 
 
-def place_links(linked: LinkedKeypoints, pair: ImagePair, members: Sequence[int]) -> Placement:
+def locate_edges(graph: KeypointGraph, pair: ImagePair, members: Sequence[int]) -> Placement:
     """Where the pair's links lie, whichever way they lead."""
     xy0, xy1, linear = [], [], []
     for at in members:
-        links = linked.links[at]
-        source, target = linked.photos[links.source_image], linked.photos[links.target_image]
-        here = linked.xy[links.source_image][links.source] * source.px_per_unit
-        there = links.carried.predicted * target.px_per_unit
-        jacobian = links.carried.jacobian * (target.px_per_unit / source.px_per_unit)
+        links = graph.links[at]
+        source, target = graph.photos[links.source_image], graph.photos[links.target_image]
+        here = graph.xy[links.source_image][links.source] * source.px_scale
+        there = links.propagated.predicted * target.px_scale
+        jacobian = links.propagated.jacobian * (target.px_scale / source.px_scale)
         onward = source.name == pair.name0
         xy0.append(here if onward else there)
         xy1.append(there if onward else here)
@@ -159,7 +159,7 @@ def place_links(linked: LinkedKeypoints, pair: ImagePair, members: Sequence[int]
     return Placement(np.concatenate(xy0), np.concatenate(xy1), np.concatenate(linear))
 
 
-def open_native_store(
+def open_refinement_store(
     path: Path, placed: Iterable[Placement], made_by: Mapping[str, Any], digests: Mapping[str, str]
 ) -> MatchStore:
     """What an earlier run has done of exactly these links; where it did others, they are removed."""
@@ -176,62 +176,62 @@ def open_native_store(
         return MatchStore(path, made_by, digests)
 
 
-def place_again(
+def refine_pairs(
     pairs: Sequence[ImagePair],
     place: Callable[[ImagePair], Placement],
     images: Sequence[ImageRef],
     matcher: HomoMatcher,
     store: MatchStore,
-    native_px: int,
+    refine_long_edge_px: int,
     quiet: bool,
 ) -> None:
     """Store what the second pass says of the pairs that the store lacks. place: where the first one put their links."""
     missing = [pair for pair in pairs if pair not in store]
     image_of = {image.name: image for image in images}
-    largest = max((math.prod(size_at(image, native_px)) for image in images), default=1)
+    largest = max((math.prod(size_at(image, refine_long_edge_px)) for image in images), default=1)
     bytes_per_number = 2 if computes_in_half(matcher.device) else 4
     bytes_per_px = bytes_per_number * matcher.net.backbone.fine_channels / matcher.net.backbone.fine_grid.stride**2
     capacity = max(2, int(matcher.config.feature_cache_mb * 1e6 / (largest * bytes_per_px)))
 
     @lru_cache(maxsize=capacity)
-    def encode(name: str, variant: Variant) -> NativeFeatures:
-        return encode_native(matcher, prepare_image(image_of[name], native_px), variant)
+    def encode(name: str, hypothesis: Hypothesis) -> RefinementFeatures:
+        return encode_for_refinement(matcher, prepare_image(image_of[name], refine_long_edge_px), hypothesis)
 
     with store_in_batches(store.write) as keep:
         for pair in tqdm(order_pairs(missing, capacity), desc="second pass", unit="pair", disable=quiet or not missing):
             names, placement = (pair.name0, pair.name1), place(pair)
-            variants = fit_variants(relate_inputs(*(encode(name, UPRIGHT) for name in names), placement))
-            keep([place_pair(matcher, *map(encode, names, variants), pair, placement)])
+            hypotheses = fit_hypotheses(relate_inputs(*(encode(name, IDENTITY) for name in names), placement))
+            keep([refine_pair(matcher, *map(encode, names, hypotheses), pair, placement)])
     store.merge()
 
 
-def relate_inputs(features0: NativeFeatures, features1: NativeFeatures, placement: Placement) -> np.ndarray:
+def relate_inputs(features0: RefinementFeatures, features1: RefinementFeatures, placement: Placement) -> np.ndarray:
     """(N, 2, 2): how points of the network's second input move with those of the first."""
     scaled_from_stored1 = np.linalg.inv(features1.stored_from_scaled)
     return scaled_from_stored1[:2, :2] @ placement.linear @ features0.stored_from_scaled[:2, :2]
 
 
-def fit_variants(linear: np.ndarray) -> tuple[Variant, Variant]:
+def fit_hypotheses(linear: np.ndarray) -> tuple[Hypothesis, Hypothesis]:
     """How to show two photos so that patches of one lie upright, and in about the same scale, in the other.
 
     linear: (N, 2, 2), see relate_inputs. The second photo is turned by quarters, the closer one reduced by powers of 2.
     """
     along, across = np.median(linear[:, 0, 0] + linear[:, 1, 1]), np.median(linear[:, 1, 0] - linear[:, 0, 1])
-    turn_deg = -90 * round(np.rad2deg(np.arctan2(across, along)) / 90) % 360
+    rotation_deg = -90 * round(np.rad2deg(np.arctan2(across, along)) / 90) % 360
     octaves = round(np.log2(np.sqrt(np.median(np.abs(np.linalg.det(linear))))))
-    return Variant(reduction=2 ** max(0, -octaves)), Variant(turn_deg, 2 ** max(0, octaves))
+    return Hypothesis(downscale=2 ** max(0, -octaves)), Hypothesis(rotation_deg, 2 ** max(0, octaves))
 
 
-def size_at(image: ImageRef, native_px: int) -> tuple[float, float]:
-    """(w, h) of a photo whose longer side is reduced to native_px."""
-    scale = min(1.0, native_px / max(image.size_wh))
+def size_at(image: ImageRef, refine_long_edge_px: int) -> tuple[float, float]:
+    """(w, h) of a photo whose longer side is reduced to refine_long_edge_px."""
+    scale = min(1.0, refine_long_edge_px / max(image.size_wh))
     return image.size_wh[0] * scale, image.size_wh[1] * scale
 
 
 @torch.inference_mode()
-def encode_native(matcher: HomoMatcher, image: PreparedImage, variant: Variant = UPRIGHT) -> NativeFeatures:
+def encode_for_refinement(matcher: HomoMatcher, image: PreparedImage, hypothesis: Hypothesis = IDENTITY) -> RefinementFeatures:
     """The fine features of a photo, strip by strip: what the backbone makes of the whole, but for the last digits."""
-    image = show_image(image, variant)
+    image = apply_hypothesis(image, hypothesis)
     backbone = matcher.net.backbone
     pixels = pad_image(torch.tensor(image.grey, device=matcher.device), backbone.stride, backbone.standardised)
     stride, height = backbone.fine_grid.stride, pixels.shape[2]
@@ -242,12 +242,12 @@ def encode_native(matcher: HomoMatcher, image: PreparedImage, variant: Variant =
             fine = backbone(pixels[:, :, first:last]).fine
         bottom = min(height, top + STRIP_PX)
         strips.append(fine[:, :, (top - first) // stride : (bottom - first) // stride])
-    return NativeFeatures(make_fine_map(torch.cat(strips, dim=2)), image.stored_from_scaled, variant.reduction)
+    return RefinementFeatures(make_fine_map(torch.cat(strips, dim=2)), image.stored_from_scaled, hypothesis.downscale)
 
 
 @torch.inference_mode()
-def place_pair(
-    matcher: HomoMatcher, features0: NativeFeatures, features1: NativeFeatures, pair: ImagePair, placement: Placement
+def refine_pair(
+    matcher: HomoMatcher, features0: RefinementFeatures, features1: RefinementFeatures, pair: ImagePair, placement: Placement
 ) -> PairMatches:
     """The second pass over a pair: in the order of `placement`; the score is 0 where a patch is of no use.
 
@@ -272,8 +272,8 @@ def place_pair(
     between[~regular] = np.eye(3)
     at = np.einsum("nij,nj->ni", between, np.concatenate([placement.xy0, np.ones((len(between), 1))], axis=1))
     score = score_from_scale(log_scale.cpu().numpy().astype(np.float64), grid)
-    if features1.reduction > 1:  # a pixel of its native resolution is less than one of the input
-        score = 1 - (1 - score) ** (1 / features1.reduction)
+    if features1.downscale > 1:  # a pixel of its native resolution is less than one of the input
+        score = 1 - (1 - score) ** (1 / features1.downscale)
     px_per_cell = np.sqrt(abs(np.linalg.det(features0.stored_from_scaled[:2, :2]))) * grid.stride
     return PairMatches(
         pair=pair,
@@ -285,10 +285,10 @@ def place_pair(
     )
 
 
-def update_links(
-    links: Links, native: Sequence[Photo], onward: bool, placement: Placement, found: PairMatches
-) -> tuple[Links, np.ndarray]:
-    """Links in px of the native resolution, as the second pass predicts them where it is of use.
+def update_edges(
+    links: TrackEdges, native: Sequence[Photo], onward: bool, placement: Placement, found: PairMatches
+) -> tuple[TrackEdges, np.ndarray]:
+    """TrackEdges in px of the native resolution, as the second pass predicts them where it is of use.
 
     onward: they lead from the first photo of the pair to the second; placement, found: of these links. Also returns how
     sure the second pass is of each, (E,): the probability that it is off by less than 1 px of the matching resolution, 0
@@ -301,21 +301,21 @@ def update_links(
     else:
         predicted = placement.xy0 + np.einsum("nij,nj->ni", inverse, placement.xy1 - found.xy1)
         jacobian = inverse
-    predicted = predicted / target.px_per_unit
-    jacobian = jacobian * (source.px_per_unit / target.px_per_unit)
+    predicted = predicted / target.px_scale
+    jacobian = jacobian * (source.px_scale / target.px_scale)
 
-    first = links.carried
+    first = links.propagated
     kept = first.predicted * target.finer
     moved = np.linalg.norm(predicted - kept, axis=1)
     near = moved <= FARTHEST * target.finer
     useful = near & (found.score >= LEAST_SCORE)
     # The first pass speaks of 1 px of the matching resolution: the same error scale, in finer px.
     dulled = 1 - (1 - first.score) ** (1 / target.finer)
-    carried = dataclasses.replace(
+    propagated = dataclasses.replace(
         first,
         predicted=np.where(useful[:, None], predicted, kept),
         jacobian=np.where(useful[:, None, None], jacobian, first.jacobian * (target.finer / source.finer)),
         score=np.where(useful, found.score, dulled),
     )
     sure = np.where(near, 1 - (1 - found.score.astype(np.float64)) ** target.finer, 0.0)
-    return dataclasses.replace(links, carried=carried), sure
+    return dataclasses.replace(links, propagated=propagated), sure

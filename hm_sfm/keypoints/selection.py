@@ -2,11 +2,11 @@
 
 import numpy as np
 
-BUDGET_CELL_PX = 32
+SELECTION_CELL_PX = 32
 """Side of the square cells over which an image's keypoints are spread, px of the matching resolution."""
 
 
-def choose_budget(
+def select_keypoints(
     label: np.ndarray, length: np.ndarray, sigma: np.ndarray, xy: np.ndarray, image: np.ndarray, budget: int
 ) -> np.ndarray:
     """(K,) bool: keypoints whose track at least half of its images choose among their best `budget`.
@@ -16,7 +16,7 @@ def choose_budget(
     """
     if len(label) == 0:
         return np.zeros(0, bool)
-    cell = np.floor(xy / BUDGET_CELL_PX).astype(np.int64).clip(-1, 100_000)
+    cell = np.floor(xy / SELECTION_CELL_PX).astype(np.int64).clip(-1, 100_000)
     place = (image * 200_000 + cell[:, 1]) * 200_000 + cell[:, 0]
     order = np.lexsort((sigma, -length, place))
     turn = np.empty(len(label), np.int64)

@@ -27,9 +27,9 @@ GOOD_SCORE = 0.5
 FEW_MATCHES = 500
 """Pairs with fewer good matches are compared as sketches: of turned photos, a few hundred can be good by chance."""
 SKETCH_LONG_EDGE_PX = 384
-TURNS_DEG = (0, *CV_ROTATIONS)
-REDUCTIONS = (2, 3)
-LEAST_REDUCTION = 1.4
+ROTATIONS_DEG = (0, *CV_ROTATIONS)
+DOWNSCALES = (2, 3)
+MIN_DOWNSCALE = 1.4
 """What differs less in scale is matched as it is."""
 NEAR_CELLS = 3
 """Matches of two sketches agree with others so far away, along each axis,"""
@@ -46,100 +46,100 @@ LEAST_GAIN = 2.0
 
 
 @dataclass(frozen=True)
-class Variant:
+class Hypothesis:
     """How a prepared photo is shown to the network."""
 
-    turn_deg: int = 0
+    rotation_deg: int = 0
     """Clockwise: 0, 90, 180 or 270."""
-    reduction: float = 1
+    downscale: float = 1
     """By how much it is smaller along both axes."""
 
 
-UPRIGHT = Variant()
-AS_THEY_ARE = (UPRIGHT, UPRIGHT)
-TURNS = tuple((UPRIGHT, Variant(turn_deg)) for turn_deg in TURNS_DEG)
+IDENTITY = Hypothesis()
+UNCHANGED = (IDENTITY, IDENTITY)
+ROTATIONS = tuple((IDENTITY, Hypothesis(rotation_deg)) for rotation_deg in ROTATIONS_DEG)
 """Variants of photo 0 and photo 1 that are compared first,"""
 SCALES = tuple(
     way
-    for reduction in REDUCTIONS
-    for turn_deg in TURNS_DEG
-    for way in ((UPRIGHT, Variant(turn_deg, reduction)), (Variant(reduction=reduction), Variant(turn_deg)))
+    for downscale in DOWNSCALES
+    for rotation_deg in ROTATIONS_DEG
+    for way in ((IDENTITY, Hypothesis(rotation_deg, downscale)), (Hypothesis(downscale=downscale), Hypothesis(rotation_deg)))
 )
 """and after them."""
 
 
-def show_image(image: PreparedImage, variant: Variant) -> PreparedImage:
+def apply_hypothesis(image: PreparedImage, hypothesis: Hypothesis) -> PreparedImage:
     """The image turned and reduced; its points map back to px of the same stored photo."""
-    if variant == UPRIGHT:
+    if hypothesis == IDENTITY:
         return image
     width, height = image.scaled_wh
-    reduced_wh = tuple(max(1, round(size / variant.reduction)) for size in image.scaled_wh)
+    reduced_wh = tuple(max(1, round(size / hypothesis.downscale)) for size in image.scaled_wh)
     grey = cv2.resize(image.grey, reduced_wh, interpolation=cv2.INTER_AREA)
-    if variant.turn_deg:
-        grey = cv2.rotate(grey, CV_ROTATIONS[variant.turn_deg])
+    if hypothesis.rotation_deg:
+        grey = cv2.rotate(grey, CV_ROTATIONS[hypothesis.rotation_deg])
     scaled_wh = (grey.shape[1], grey.shape[0])
     scaled_from_reduced = np.diag([width / reduced_wh[0], height / reduced_wh[1], 1.0])
-    reduced_from_turned = rotation_matrix(scaled_wh, -variant.turn_deg % 360)
+    reduced_from_turned = rotation_matrix(scaled_wh, -hypothesis.rotation_deg % 360)
     # Providers of coarse matches that read the photo themselves turn it as its reference says.
-    ref = dataclasses.replace(image.ref, rotation_deg=(image.ref.rotation_deg + variant.turn_deg) % 360)
+    ref = dataclasses.replace(image.ref, rotation_deg=(image.ref.rotation_deg + hypothesis.rotation_deg) % 360)
     return PreparedImage(ref, grey, scaled_wh, image.stored_from_scaled @ scaled_from_reduced @ reduced_from_turned)
 
 
 class Sketch:
-    """The coarse features of one photo at a small size, by variant, made as they are asked for."""
+    """The coarse features of one photo at a small size, by hypothesis, made as they are asked for."""
 
     def __init__(self, matcher: "HomoMatcher", image: PreparedImage) -> None:
-        self.reduction = max(1.0, max(image.scaled_wh) / SKETCH_LONG_EDGE_PX)
-        self.matcher, self.image = matcher, show_image(image, Variant(reduction=self.reduction))
-        self.cells: dict[Variant, Tensor] = {}
+        self.downscale = max(1.0, max(image.scaled_wh) / SKETCH_LONG_EDGE_PX)
+        self.matcher, self.image = matcher, apply_hypothesis(image, Hypothesis(downscale=self.downscale))
+        self.cells: dict[Hypothesis, Tensor] = {}
 
     @property
     def size_bytes(self) -> int:
         """Memory that it takes."""
         return self.image.grey.nbytes + sum(cells.nbytes for cells in self.cells.values())
 
-    def get(self, variant: Variant) -> Tensor:
+    def get(self, hypothesis: Hypothesis) -> Tensor:
         """(H, W, C) float32, as HomoMatcher.encode_coarse makes them."""
-        if variant not in self.cells:
-            self.cells[variant] = self.matcher.encode_coarse(show_image(self.image, variant))
-        return self.cells[variant]
+        if hypothesis not in self.cells:
+            self.cells[hypothesis] = self.matcher.encode_coarse(apply_hypothesis(self.image, hypothesis))
+        return self.cells[hypothesis]
 
 
-def choose_variants(matcher: "HomoMatcher", sketch0: Sketch, sketch1: Sketch) -> tuple[Variant, Variant] | None:
+def choose_hypotheses(matcher: "HomoMatcher", sketch0: Sketch, sketch1: Sketch) -> tuple[Hypothesis, Hypothesis] | None:
     """How to show two photos so that they match, or None where they do as they are, or no way stands out.
 
     Photo 0 is never turned, and at most one of the two is reduced. Of equally good ways the first one is taken: the one
     that reduces or turns less.
     """
 
-    def count(variant0: Variant, variant1: Variant) -> int:
+    def count(hypothesis0: Hypothesis, hypothesis1: Hypothesis) -> int:
         # The smaller sketch comes first: the matrix of similarities goes by its rows.
-        cells0, cells1 = sorted((sketch0.get(variant0), sketch1.get(variant1)), key=Tensor.numel)
+        cells0, cells1 = sorted((sketch0.get(hypothesis0), sketch1.get(hypothesis1)), key=Tensor.numel)
         index0, index1, _ = matcher.match_coarse(cells0, cells1)
         return count_agreeing(place_cells(index0, cells0.shape[1]), place_cells(index1, cells1.shape[1]))
 
-    counts = {way: count(*way) for way in TURNS}
+    counts = {way: count(*way) for way in ROTATIONS}
     if max(counts.values()) < ENOUGH_AGREEING:
         counts |= {way: count(*way) for way in SCALES}
     best = max(counts, key=counts.__getitem__)
-    needed = LEAST_AGREEING if best == AS_THEY_ARE else max(LEAST_AGREEING, LEAST_GAIN * counts[AS_THEY_ARE])
+    needed = LEAST_AGREEING if best == UNCHANGED else max(LEAST_AGREEING, LEAST_GAIN * counts[UNCHANGED])
     if counts[best] < needed:
         return None
-    chosen = relate_scales(best, sketch0.reduction, sketch1.reduction)
-    return None if chosen == AS_THEY_ARE else chosen
+    chosen = relate_scales(best, sketch0.downscale, sketch1.downscale)
+    return None if chosen == UNCHANGED else chosen
 
 
-def relate_scales(way: tuple[Variant, Variant], reduction0: float, reduction1: float) -> tuple[Variant, Variant]:
-    """Variants of two photos that have the turns and the relative scale of these variants of their sketches.
+def relate_scales(way: tuple[Hypothesis, Hypothesis], downscale0: float, downscale1: float) -> tuple[Hypothesis, Hypothesis]:
+    """Variants of two photos that have the turns and the relative scale of these hypotheses of their sketches.
 
-    reduction0, reduction1: of the sketches against the photos, which may be of different sizes.
+    downscale0, downscale1: of the sketches against the photos, which may be of different sizes.
     """
-    reductions = way[0].reduction * reduction0, way[1].reduction * reduction1
-    factors = [reduction / min(reductions) for reduction in reductions]
-    variant0, variant1 = (
-        Variant(variant.turn_deg, factor if factor >= LEAST_REDUCTION else 1) for variant, factor in zip(way, factors)
+    reductions = way[0].downscale * downscale0, way[1].downscale * downscale1
+    factors = [downscale / min(reductions) for downscale in reductions]
+    hypothesis0, hypothesis1 = (
+        Hypothesis(hypothesis.rotation_deg, factor if factor >= MIN_DOWNSCALE else 1) for hypothesis, factor in zip(way, factors)
     )
-    return variant0, variant1
+    return hypothesis0, hypothesis1
 
 
 def place_cells(index: np.ndarray, columns: int) -> np.ndarray:
@@ -160,10 +160,10 @@ def count_agreeing(cell0: np.ndarray, cell1: np.ndarray) -> int:
     return int(np.count_nonzero((support >= LEAST_SUPPORT) & (support >= LEAST_SHARE * near.sum(axis=1))))
 
 
-def match_again(
+def retry_hypotheses(
     matcher: "HomoMatcher",
     first: PatchMatches,
-    encode: Callable[[int, Variant], "ImageFeatures"],
+    encode: Callable[[int, Hypothesis], "ImageFeatures"],
     sketch: Callable[[int], Sketch],
 ) -> PatchMatches:
     """The matches of two photos: `first`, found in the photos as they are, or those found another way, if better.
@@ -171,12 +171,12 @@ def match_again(
     encode, sketch: give the features and the sketch of photo 0 or 1; called only where `first` has few good matches and
     the configuration allows it. The result depends on nothing but the two photos.
     """
-    if not matcher.config.retry_turned or count_good(first) >= FEW_MATCHES:
+    if not matcher.config.try_hypotheses or count_good(first) >= FEW_MATCHES:
         return first
-    variants = choose_variants(matcher, sketch(0), sketch(1))
-    if variants is None:
+    hypotheses = choose_hypotheses(matcher, sketch(0), sketch(1))
+    if hypotheses is None:
         return first
-    second = matcher.match_features(*(encode(side, variant) for side, variant in enumerate(variants)))
+    second = matcher.match_features(*(encode(side, hypothesis) for side, hypothesis in enumerate(hypotheses)))
     return max(first, second, key=count_good)
 
 

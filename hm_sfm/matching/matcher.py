@@ -26,7 +26,7 @@ from hm_sfm.network.growth import GridMatches, PatchGrid, grow_matches
 from hm_sfm.network.homography import is_regular, make_corners
 from hm_sfm.network.resnet import LoftrBackbone
 from hm_sfm.types import ImageRef, PatchMatches
-from hm_sfm.matching.hypotheses import Sketch, match_again, show_image
+from hm_sfm.matching.hypotheses import Sketch, retry_hypotheses, apply_hypothesis
 
 WEIGHTS_FOLDER = Path(__file__).parents[1] / "network" / "weights"
 FINE_CHUNK = 512
@@ -158,10 +158,10 @@ class HomoMatcher:
         Coordinates are px of the images as stored. Raises InputError on an unreadable image.
         """
         images = [self._prepare(image) for image in (image0, image1)]
-        return match_again(
+        return retry_hypotheses(
             self,
             self.match_features(*(self.encode(image) for image in images)),
-            lambda side, variant: self.encode(show_image(images[side], variant)),
+            lambda side, hypothesis: self.encode(apply_hypothesis(images[side], hypothesis)),
             lambda side: Sketch(self, images[side]),
         )
 

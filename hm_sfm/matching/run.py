@@ -16,7 +16,7 @@ from hm_sfm.matching.matcher import HomoMatcher, ImageFeatures
 from hm_sfm.matching.order import order_pairs
 from hm_sfm.matching.store import MatchStore
 from hm_sfm.types import ImagePair, ImageRef, PairMatches, PatchMatches
-from hm_sfm.matching.hypotheses import UPRIGHT, Sketch, Variant, match_again, show_image
+from hm_sfm.matching.hypotheses import IDENTITY, Sketch, Hypothesis, retry_hypotheses, apply_hypothesis
 
 
 @dataclass(frozen=True)
@@ -33,23 +33,23 @@ class FeatureCache:
     def __init__(self, images: Sequence[ImageRef], matcher: HomoMatcher, limit_mb: int, progress: tqdm) -> None:
         self.images = {image.name: image for image in images}
         self.matcher, self.limit_bytes, self.progress = matcher, limit_mb * 1_000_000, progress
-        self.cached: OrderedDict[tuple[str, Variant | None], ImageFeatures | Sketch] = OrderedDict()
+        self.cached: OrderedDict[tuple[str, Hypothesis | None], ImageFeatures | Sketch] = OrderedDict()
         self.seen: set[str] = set()
         self.seconds = 0.0
 
-    def get(self, name: str, variant: Variant = UPRIGHT) -> ImageFeatures:
+    def get(self, name: str, hypothesis: Hypothesis = IDENTITY) -> ImageFeatures:
         """Features of a photo. Raises InputError where it cannot be decoded."""
-        return self._keep(name, variant, lambda image: self.matcher.encode(show_image(image, variant)))
+        return self._keep(name, hypothesis, lambda image: self.matcher.encode(apply_hypothesis(image, hypothesis)))
 
     def sketch(self, name: str) -> Sketch:
         """The sketch of a photo. Raises as get does."""
         return self._keep(name, None, lambda image: Sketch(self.matcher, image))
 
     def _keep(
-        self, name: str, variant: Variant | None, make: Callable[[PreparedImage], ImageFeatures | Sketch]
+        self, name: str, hypothesis: Hypothesis | None, make: Callable[[PreparedImage], ImageFeatures | Sketch]
     ) -> ImageFeatures | Sketch:
-        """What was made of a photo, or is now. variant: None for its sketch."""
-        key = (name, variant)
+        """What was made of a photo, or is now. hypothesis: None for its sketch."""
+        key = (name, hypothesis)
         if key in self.cached:
             self.cached.move_to_end(key)
             return self.cached[key]
@@ -67,17 +67,17 @@ class FeatureCache:
     def match(self, pair: ImagePair) -> PairMatches:
         """Match two photos. Raises ConfigError where their features alone exceed the limit."""
         names = (pair.name0, pair.name1)
-        found = match_again(
+        found = retry_hypotheses(
             self.matcher,
             self._match_upright(pair),
-            lambda side, variant: self.get(names[side], variant),
+            lambda side, hypothesis: self.get(names[side], hypothesis),
             lambda side: self.sketch(names[side]),
         )
         return PairMatches(pair=pair, **vars(found))
 
     def _match_upright(self, pair: ImagePair) -> PatchMatches:
         """The matches of two photos as they are. Raises as match does."""
-        if (pair.name1, UPRIGHT) in self.cached:
+        if (pair.name1, IDENTITY) in self.cached:
             self.get(pair.name1)  # it is not given up for the other
         features = self.get(pair.name0), self.get(pair.name1)
         size_bytes = sum(image.size_bytes for image in features)

@@ -21,7 +21,7 @@ from hm_sfm.config import fingerprint
 from hm_sfm.photos.images import prepare_image
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.types import ImageRef
-from hm_sfm.matching.hypotheses import TURNS_DEG, Variant, show_image
+from hm_sfm.matching.hypotheses import ROTATIONS_DEG, Hypothesis, apply_hypothesis
 
 logger = logging.getLogger(__name__)
 
@@ -103,13 +103,13 @@ def describe_images(
 ) -> np.ndarray:
     """Global descriptors (N, D) float32 of unit length, none of it negative, in the order of the images.
 
-    digests: of the photos, by name. turned: as they are and turned clockwise, by each of TURNS_DEG, (T, N, D): the words
+    digests: of the photos, by name. turned: as they are and turned clockwise, by each of ROTATIONS_DEG, (T, N, D): the words
     are then those of all turns. Photos that the store lacks are encoded into it, in batches. Raises InputError on an
     undecodable photo; what was stored by then stays.
     """
-    turns_deg = TURNS_DEG if turned else (0,)
+    turns_deg = ROTATIONS_DEG if turned else (0,)
     encode_images(images, digests, matcher, store, quiet, turns_deg)
-    keys = [name_sample(digests[image.name], turn_deg) for turn_deg in turns_deg for image in images]
+    keys = [name_sample(digests[image.name], rotation_deg) for rotation_deg in turns_deg for image in images]
     vocabulary = learn_vocabulary(store.read(keys, max(1, VOCABULARY_CELLS // len(keys))))
     described = weigh_words(np.stack([count_words(cells, vocabulary) for cells in store.read(keys)]))
     return described.reshape(len(turns_deg), len(images), -1) if turned else described
@@ -127,21 +127,21 @@ def encode_images(
     missing = {
         digests[image.name]: image
         for image in images
-        if any(name_sample(digests[image.name], turn_deg) not in store for turn_deg in turns_deg)
+        if any(name_sample(digests[image.name], rotation_deg) not in store for rotation_deg in turns_deg)
     }
     with store_in_batches(lambda batch: store.write(dict(batch))) as keep:
         for digest, image in tqdm(missing.items(), desc="retrieval", unit="image", disable=quiet or not missing):
             prepared = prepare_image(image, LONG_EDGE_PX)
-            for turn_deg in turns_deg:
-                key = name_sample(digest, turn_deg)
+            for rotation_deg in turns_deg:
+                key = name_sample(digest, rotation_deg)
                 if key not in store:
-                    cells = matcher.encode_plain(show_image(prepared, Variant(turn_deg))).cpu().numpy()
+                    cells = matcher.encode_plain(apply_hypothesis(prepared, Hypothesis(rotation_deg))).cpu().numpy()
                     keep([(key, sample_cells(cells))])
 
 
-def name_sample(digest: str, turn_deg: int) -> str:
+def name_sample(digest: str, rotation_deg: int) -> str:
     """The name in a CellStore of the sample of a turned photo; that of the photo as it is has its digest."""
-    return f"{digest}-{turn_deg}" if turn_deg else digest
+    return f"{digest}-{rotation_deg}" if rotation_deg else digest
 
 
 def sample_cells(cells: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from hm_sfm.report.diagnosis import Diagnosis, diagnose
 from hm_sfm.errors import InputError, NoModelError
 from hm_sfm.formats.hloc import write_features, write_matches
 from hm_sfm.photos.images import list_images, prepare_image
-from hm_sfm.keypoints.propagation import LinkedKeypoints, Photo, find_seeds, finish_keypoints, link_keypoints, thin_links
+from hm_sfm.keypoints.propagation import KeypointGraph, Photo, find_seeds, finish_keypoints, propagate_keypoints, prune_edges
 from hm_sfm.io.locks import lock_file, release_locks, wait_in_line
 from hm_sfm.colmap.mapping import choose_mapper, map_images, summarise_models
 from hm_sfm.photos.masks import NO_MASKS, MaskedStore, Masks, read_masks
@@ -37,7 +37,7 @@ from hm_sfm.report.page import write_report
 from hm_sfm.pairs.retrieval import CellStore, describe_images, find_similar
 from hm_sfm.colmap.rigs import expand_pairs, read_rigs
 from hm_sfm.matching.shards import Shard, merge_shards, refuse_shards
-from hm_sfm.keypoints.refinement import sharpen_links
+from hm_sfm.keypoints.refinement import refine_keypoints
 from hm_sfm.matching.store import MatchStore, digest_image
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, MappingResult
 from hm_sfm.colmap.verification import VerifiedPair, verify_database, verify_pairs
@@ -127,7 +127,7 @@ def merge_matches(image_folder: Path, out: Path, config: Config) -> int:
 def export_database(image_folder: Path, out: Path, config: Config, quiet: bool = False) -> Matched:
     """As match_photos, then OUT/database.db with persistent keypoints and verified matches."""
     matched = match_photos(image_folder, out, config, quiet)
-    keypoints, matches = verify_and_carry(matched, config, quiet)
+    keypoints, matches = verify_and_propagate(matched, config, quiet)
     write_verified(matched, keypoints, matches, Path(out) / "database.db", config)
     return matched
 
@@ -140,7 +140,7 @@ def write_verified(
         write_database(path, matched.images, matched.cameras, keypoints, matches)
         verify_database(
             path,
-            config.verification.max_error_px * max(measure_units(matched.images, config).values()),
+            config.verification.max_error_px * max(measure_px_scales(matched.images, config).values()),
             config.verification.min_inliers,
             config.verification.min_inlier_ratio,
         )
@@ -153,19 +153,19 @@ def export_hloc(image_folder: Path, out: Path, config: Config, quiet: bool = Fal
     The pairs are those of OUT/pairs.txt. Raises InputError where image names differ in "/" and "-" only.
     """
     matched = match_photos(image_folder, out, config, quiet)
-    keypoints, matches = verify_and_carry(matched, config, quiet)
+    keypoints, matches = verify_and_propagate(matched, config, quiet)
     folder = Path(out) / "hloc"
-    write_features(folder / "features.h5", matched.images, keypoints, measure_units(matched.images, config))
+    write_features(folder / "features.h5", matched.images, keypoints, measure_px_scales(matched.images, config))
     write_matches(folder / "matches.h5", matched.pairs, keypoints, matches)
     return matched
 
 
-def verify_and_carry(
+def verify_and_propagate(
     matched: Matched, config: Config, quiet: bool = False, seeds: Mapping[str, np.ndarray] | None = None
 ) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
-    """Persistent keypoints from matches: verify_pairs, then carry_keypoints; adds to the seconds of `matched`.
+    """Persistent keypoints from matches: verify_pairs, then persist_verified; adds to the seconds of `matched`.
 
-    seeds: as in carry_keypoints.
+    seeds: as in persist_verified.
     """
     images = matched.images
     cameras = {image.name: matched.cameras.cameras[i] for image, i in zip(images, matched.cameras.camera_index)}
@@ -175,12 +175,12 @@ def verify_and_carry(
             matched.pairs,
             matched.store.read,
             cameras,
-            measure_units(images, config),
+            measure_px_scales(images, config),
             config.verification,
             quiet,
         )
     with stopwatch(matched.seconds, "keypoints"):
-        return carry_keypoints(images, verified, matched.store, config, quiet, matched.store.masks, seeds)
+        return persist_verified(images, verified, matched.store, config, quiet, matched.store.masks, seeds)
 
 
 @release_locks()
@@ -234,7 +234,7 @@ def choose_pairs(
     """
     image_of = {image.name: image for image in images}
 
-    def rank_by_looks(names: Sequence[str], top: int, gap: int) -> np.ndarray:
+    def rank_by_appearance(names: Sequence[str], top: int, gap: int) -> np.ndarray:
         claim_folder(Path(out), shared)
         matcher = HomoMatcher.from_pretrained(
             config.matching.model, config=config.matching, images=config.images, network=config.network
@@ -244,12 +244,12 @@ def choose_pairs(
         folder = Path(out) / "retrieval"
         with wait_in_line(folder / ".lock"):  # other shards find the photos encoded
             store = CellStore(folder, digest_weights(config.matching.model))
-            turned = config.matching.retry_turned
+            turned = config.matching.try_hypotheses
             return find_similar(describe_images(photos, digests, matcher, store, quiet, turned), top, gap)
 
     positions = {image.name: image.gps for image in images if image.gps}
     names = [image.name for image in images]
-    pairs = select_pairs(names, config.pairs, rank_by_looks, positions)
+    pairs = select_pairs(names, config.pairs, rank_by_appearance, positions)
     if config.cameras.rig and config.pairs.mode == "sequential":  # each camera of a rig is a sequence for itself
         pairs = expand_pairs(pairs, read_rigs(Path(config.cameras.rig)), names, Path(config.cameras.rig))
     return pairs
@@ -288,12 +288,12 @@ def open_store(path: Path, images: Sequence[ImageRef], config: Config) -> MatchS
     return MatchStore(path, describe_matching(config), {image.name: digest_image(image) for image in images})
 
 
-def measure_units(images: Sequence[ImageRef], config: Config) -> dict[str, float]:
+def measure_px_scales(images: Sequence[ImageRef], config: Config) -> dict[str, float]:
     """Image name -> px of the stored image per px of the matching resolution."""
     return {image.name: max(1.0, max(image.size_wh) / config.images.long_edge_px) for image in images}
 
 
-def carry_keypoints(
+def persist_verified(
     images: Sequence[ImageRef],
     verified: Mapping[ImagePair, VerifiedPair],
     store: MatchStore | MaskedStore,
@@ -309,12 +309,12 @@ def carry_keypoints(
 
     Returns the Keypoints of every image, in the order of `images`, and the IndexMatches of the pairs that share tracks.
     """
-    px_per_unit = measure_units(images, config)
+    px_scale = measure_px_scales(images, config)
     photos = [
         Photo(
             image.name,
             image.size_wh,
-            px_per_unit[image.name],
+            px_scale[image.name],
             find_seeds(prepare_image(image, config.images.long_edge_px)) if seeds is None else seeds[image.name],
             partial(masks.hides, image.name) if image.name in masks.packed else None,
             seeds_are_exact=seeds is not None,
@@ -322,30 +322,30 @@ def carry_keypoints(
         for image in tqdm(images, desc="seeds", unit="image", disable=quiet)
     ]
     ranked = sorted(verified.values(), key=lambda found: (-found.strength, found.pair))
-    linked = link_keypoints(
+    graph = propagate_keypoints(
         photos,
         [found.pair for found in ranked],
         lambda pair: store.read(pair).select(verified[pair].inliers),
         config.keypoints,
         quiet,
     )
-    if config.keypoints.native_px and config.network.head == "homography":
-        linked = thin_links(linked, config.keypoints)  # the second pass is worth its time for what is kept only
-        linked = sharpen(linked, images, store.store if isinstance(store, MaskedStore) else store, config, quiet)
-    return finish_keypoints(linked, config.keypoints)
+    if config.keypoints.refine_long_edge_px and config.network.head == "homography":
+        graph = prune_edges(graph, config.keypoints)  # the second pass is worth its time for what is kept only
+        graph = sharpen(graph, images, store.store if isinstance(store, MaskedStore) else store, config, quiet)
+    return finish_keypoints(graph, config.keypoints)
 
 
 def sharpen(
-    linked: LinkedKeypoints, images: Sequence[ImageRef], store: MatchStore, config: Config, quiet: bool
-) -> LinkedKeypoints:
-    """sharpen_links with the matcher of the configuration; what is done is kept beside the matches."""
+    graph: KeypointGraph, images: Sequence[ImageRef], store: MatchStore, config: Config, quiet: bool
+) -> KeypointGraph:
+    """refine_keypoints with the matcher of the configuration; what is done is kept beside the matches."""
     # The coarse matches are made already, whoever made them.
     matching = dataclasses.replace(config.matching, coarse="light", coarse_matches="", coarse_features="")
     matcher = HomoMatcher.from_pretrained(matching.model, config=matching, images=config.images, network=config.network)
-    native_px = max(config.keypoints.native_px, config.images.long_edge_px)
-    made_by = {**store.made_by, "keypoints.native_px": native_px}
-    path = store.path.with_name("native.h5")
-    return sharpen_links(linked, images, matcher, native_px, path, made_by, store.digests, quiet)
+    refine_long_edge_px = max(config.keypoints.refine_long_edge_px, config.images.long_edge_px)
+    made_by = {**store.made_by, "keypoints.refine_long_edge_px": refine_long_edge_px}
+    path = store.path.with_name("refined.h5")
+    return refine_keypoints(graph, images, matcher, refine_long_edge_px, path, made_by, store.digests, quiet)
 
 
 def write_summary(

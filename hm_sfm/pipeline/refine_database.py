@@ -1,4 +1,4 @@
-"""The keypoints of an existing COLMAP database, whoever made them, refined by homographies and carried to more images.
+"""The keypoints of an existing COLMAP database, whoever made them, refined by homographies and propagated to more images.
 
 Its verified matches are the coarse matches: homographies are estimated around them, and what follows is as in a run of
 our own, with the database's matched keypoints as the seeds of tracks. Its cameras are kept.
@@ -27,7 +27,7 @@ from hm_sfm.io.locks import release_locks
 from hm_sfm.photos.masks import MaskedStore, read_masks
 from hm_sfm.matching.run import match_pairs
 from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.pipeline.reconstruction import Matched, claim_folder, open_store, verify_and_carry, write_verified
+from hm_sfm.pipeline.reconstruction import Matched, claim_folder, open_store, verify_and_propagate, write_verified
 from hm_sfm.types import ImagePair, ImageRef
 
 
@@ -73,7 +73,7 @@ def refine_database(
     store = open_store(out / "matches.h5", found.images, config)
     seconds = dataclasses.asdict(match_pairs(found.images, pairs, matcher, store, quiet))
     matched = Matched(found.images, 0, pairs, found.cameras, MaskedStore(store, masks), seconds)
-    keypoints, matches = verify_and_carry(matched, config, quiet, rank_keypoints(found))
+    keypoints, matches = verify_and_propagate(matched, config, quiet, rank_keypoints(found))
     write_verified(matched, keypoints, matches, out / "database.db", config)
     return matched, out / "database.db"
 

@@ -34,7 +34,7 @@ UP_IN_PHOTO = {0: (0, -1, 0), 90: (-1, 0, 0), 180: (0, 1, 0), 270: (1, 0, 0)}
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageFigures:
+class ImageMetrics:
     """One photo of the collection."""
 
     name: str
@@ -88,7 +88,7 @@ class Report:
     title: str
     summary: Mapping[str, Any]
     """As summary.json has it."""
-    images: tuple[ImageFigures, ...]
+    images: tuple[ImageMetrics, ...]
     num_pairs: int
     """That were matched."""
     links: Mapping[tuple[int, int], int]
@@ -155,7 +155,7 @@ def measure_images(
     keypoints: Mapping[str, np.ndarray],
     observations: tuple[np.ndarray, np.ndarray, np.ndarray],
     reasons: Mapping[str, str],
-) -> list[ImageFigures]:
+) -> list[ImageMetrics]:
     """The figures of each image. observations: see list_observations, of the model."""
     point, image, keypoint = observations
     registered = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
@@ -175,7 +175,7 @@ def measure_images(
     for ref in images:
         number = number_of.get(ref.name)
         figures.append(
-            ImageFigures(
+            ImageMetrics(
                 name=ref.name,
                 registered=number is not None,
                 keypoints=len(keypoints[ref.name]),

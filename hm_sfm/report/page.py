@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from hm_sfm.io.atomic import replace_file
-from hm_sfm.report.gather import ImageFigures, Report, Scene, WeakPair
+from hm_sfm.report.gather import ImageMetrics, Report, Scene, WeakPair
 
 MOST_LINKS = 4000
 """Strongest links that the graph draws."""
@@ -124,7 +124,7 @@ def encode(array: np.ndarray) -> str:
     return base64.b64encode(array.astype(array.dtype.newbyteorder("<")).tobytes()).decode()
 
 
-def render_images(images: Sequence[ImageFigures]) -> str:
+def render_images(images: Sequence[ImageMetrics]) -> str:
     """The rows of the table of images."""
     rows = []
     for image in images:
@@ -199,7 +199,7 @@ def render_track_lengths(histograms: Mapping[str, Mapping[int, int]]) -> str:
 <p class="legend">{legend}</p>"""
 
 
-def render_graph(images: Sequence[ImageFigures], links: Mapping[tuple[int, int], int]) -> str:
+def render_graph(images: Sequence[ImageMetrics], links: Mapping[tuple[int, int], int]) -> str:
     """The images on a ring, in the order of their names; lines are the stronger the more matches a pair has."""
     angle = 2 * np.pi * np.arange(len(images)) / max(1, len(images)) - np.pi / 2
     x, y = RING * np.cos(angle), RING * np.sin(angle)

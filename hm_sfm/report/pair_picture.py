@@ -63,8 +63,8 @@ def draw_pair(matcher: HomoMatcher, path_a: Path, path_b: Path, checks: Verifica
     good = matches.select(matches.score >= checks.min_score)
     # One by one: photos of two folders may have the same name.
     cameras = [make_cameras([ref], CameraConfig()).cameras[0] for ref in refs]
-    px_per_unit = max(1.0, max(max(ref.size_wh) for ref in refs) / matcher.images.long_edge_px)
-    max_error_px = checks.max_error_px * px_per_unit
+    px_scale = max(1.0, max(max(ref.size_wh) for ref in refs) / matcher.images.long_edge_px)
+    max_error_px = checks.max_error_px * px_scale
     agreeing = verify_pair(good, *cameras, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
     count = int(np.count_nonzero(agreeing))
     is_verified = is_convincing(count, len(good), checks)

@@ -140,12 +140,12 @@ class PhotoPairs(Dataset):
         anchor = rng.integers(len(pair.xy0))
         ratio = np.exp(rng.uniform(-0.5, 0.5) * np.log(LARGEST_RATIO))
         longer_px = rng.uniform(0.95, 1.6) * max(self.size_wh)
-        turn_deg = rng.normal(0, TURN_DEG) if rng.random() < 0.3 else 0.0
+        rotation_deg = rng.normal(0, TURN_DEG) if rng.random() < 0.3 else 0.0
         images, mapped = [], []
         for path, xy, sign in ((pair.path0, pair.xy0, 1), (pair.path1, pair.xy1, -1)):
             photo = read_grey(path)
             scale = min(longer_px * ratio**sign / max(photo.shape), 1.2)
-            view_from_photo = self._draw_window(photo.shape, xy[anchor], scale, sign * turn_deg / 2, rng)
+            view_from_photo = self._draw_window(photo.shape, xy[anchor], scale, sign * rotation_deg / 2, rng)
             view = render_view(photo, view_from_photo, self.size_wh)
             shown = cv2.warpPerspective(np.ones_like(photo), homography_to_pixel_index(view_from_photo), self.size_wh)
             # Where the photo ends there is nothing to see, not its mirror image, which could be matched.
@@ -163,11 +163,11 @@ class PhotoPairs(Dataset):
         }
 
     def _draw_window(
-        self, shape_hw: tuple[int, int], anchor: np.ndarray, scale: float, turn_deg: float, rng: np.random.Generator
+        self, shape_hw: tuple[int, int], anchor: np.ndarray, scale: float, rotation_deg: float, rng: np.random.Generator
     ) -> np.ndarray:
         """(3, 3) px of the photo -> px of the view. The view shows the photo's point `anchor`, and no more of what is
         beyond the photo's borders than it must (but for the turn)."""
-        cosine, sine = scale * np.cos(np.radians(turn_deg)), scale * np.sin(np.radians(turn_deg))
+        cosine, sine = scale * np.cos(np.radians(rotation_deg)), scale * np.sin(np.radians(rotation_deg))
         matrix = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
         view, photo = np.array(self.size_wh), scale * np.array(shape_hw[::-1])
         corner = view * rng.uniform(0.25, 0.75, size=2) - scale * anchor

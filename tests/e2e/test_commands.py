@@ -115,7 +115,7 @@ def test_export_stops_after_the_database(scene, reconstructed, tmp_path, run, ma
     assert finished.code == 0
     assert matched_pairs == []
     assert finished.out == f"5 images and their keypoints: {out / 'database.db'}\n"
-    assert {path.name for path in out.iterdir()} == {".hm_sfm", "pairs.txt", "matches.h5", "native.h5", "database.db"}
+    assert {path.name for path in out.iterdir()} == {".hm_sfm", "pairs.txt", "matches.h5", "refined.h5", "database.db"}
     with pycolmap.Database.open(out / "database.db") as database:
         assert database.num_images() == 5
         assert database.num_verified_image_pairs() >= 7

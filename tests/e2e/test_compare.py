@@ -260,7 +260,7 @@ def test_out_of_another_comparison(scene, compared, options, run, digest_files):
 
 
 def test_export_in_hlocs_format(scene, exported, reconstructed):
-    assert {path.name for path in exported.iterdir()} == {".hm_sfm", "pairs.txt", "matches.h5", "native.h5", "hloc"}
+    assert {path.name for path in exported.iterdir()} == {".hm_sfm", "pairs.txt", "matches.h5", "refined.h5", "hloc"}
     images = list_images(scene.images).images
     pairs = read_pairs(exported / "pairs.txt", [image.name for image in images])
     keypoints = read_features(exported / "hloc" / "features.h5", images)

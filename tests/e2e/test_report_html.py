@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from hm_sfm.config import Config
-from hm_sfm.report.gather import ImageFigures, Report, Scene, WeakPair
+from hm_sfm.report.gather import ImageMetrics, Report, Scene, WeakPair
 from hm_sfm.report.page import render_page
 from hm_sfm.types import ImagePair
 
@@ -106,7 +106,7 @@ def large_report() -> Report:
     """100 images, 4950 verified pairs, the most points and pictures of noise: as large as a report of 100 images is."""
     rng = np.random.default_rng(0)
     images = tuple(
-        ImageFigures(
+        ImageMetrics(
             name=f"folder {i % 3}/<IMG>_{i}.jpg", registered=True, keypoints=8000, observations=6000 - i,
             mean_error_px=0.3, neighbours=99, reason="",
         )

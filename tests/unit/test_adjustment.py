@@ -43,7 +43,7 @@ def test_a_misplaced_keypoint_returns_where_its_links_agree(backward):
     ends = (last, others) if backward else (others, last)
     source, target = np.concatenate([source, ends[0]]), np.concatenate([target, ends[1]])
     jacobian = np.tile(np.array([[1.2, 0.1], [-0.2, 0.9]]), (len(source), 1, 1))
-    # Links are told at the first positions: exact ones do not hold where xy is off.
+    # TrackEdges are told at the first positions: exact ones do not hold where xy is off.
     predicted = make_links(truth, source, target, jacobian, xy)
     moved, _ = adjust_keypoints(xy, source, target, predicted, jacobian, np.ones(len(source)), ROUNDS)
     assert np.linalg.norm(xy[8] - truth[8]) > 0.7

@@ -223,7 +223,7 @@ def test_a_photo_twice_as_large_as_the_matching_resolution(matcher, waves, image
 
 
 def test_the_coarse_grid_is_where_it_says(matcher, waves, image):
-    """An offset d of the coarse grid shows as (1 - s) d between an image and its reduction.
+    """An offset d of the coarse grid shows as (1 - s) d between an image and its downscale.
 
     The trunk's odd strided convolutions alone would put cells at 8 i + 0.5 px: 1 px of difference here.
     """

@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hm_sfm.keypoints.selection import choose_budget, rank_in_groups
+from hm_sfm.keypoints.selection import select_keypoints, rank_in_groups
 from hm_sfm.config import KeypointConfig
 from hm_sfm.photos.images import prepare_array
 from hm_sfm.keypoints.propagation import (
-    CARRYING,
+    MIN_PROPAGATING,
     Photo,
     choose_good,
     differentiate,
@@ -17,9 +17,9 @@ from hm_sfm.keypoints.propagation import (
     find_seeds,
     finish_keypoints,
     group_matches,
-    link_keypoints,
+    propagate_keypoints,
     persist_keypoints,
-    thin_links,
+    prune_edges,
     thin_points,
 )
 from hm_sfm.types import ImagePair, PairMatches, apply_homographies
@@ -28,18 +28,18 @@ CONFIG = KeypointConfig()
 SIZE_WH = (128, 96)
 
 
-def make_photo(name: str, *seeds: tuple[float, float], px_per_unit: float = 1.0) -> Photo:
-    size_wh = tuple(round(side * px_per_unit) for side in SIZE_WH)
-    return Photo(name, size_wh, px_per_unit, np.array(seeds, float).reshape(-1, 2))
+def make_photo(name: str, *seeds: tuple[float, float], px_scale: float = 1.0) -> Photo:
+    size_wh = tuple(round(side * px_scale) for side in SIZE_WH)
+    return Photo(name, size_wh, px_scale, np.array(seeds, float).reshape(-1, 2))
 
 
-def make_pair(name_a: str, name_b: str, b_from_a: np.ndarray, score: float = 0.9, px_per_unit=1.0) -> PairMatches:
+def make_pair(name_a: str, name_b: str, b_from_a: np.ndarray, score: float = 0.9, px_scale=1.0) -> PairMatches:
     """Patches every 8 px of image a that fall into image b, all with the same homography; in the order of the names."""
     x, y = np.meshgrid(np.arange(4, SIZE_WH[0], 8) + 1.0, np.arange(4, SIZE_WH[1], 8) + 1.0)
-    xy_a = np.stack([x.ravel(), y.ravel()], axis=1) * px_per_unit
+    xy_a = np.stack([x.ravel(), y.ravel()], axis=1) * px_scale
     b_from_a = np.array(b_from_a, float)
     xy_b = apply_homographies(np.tile(b_from_a, (len(xy_a), 1, 1)), xy_a)
-    inside = np.all((xy_b >= 0) & (xy_b < np.array(SIZE_WH) * px_per_unit), axis=1)
+    inside = np.all((xy_b >= 0) & (xy_b < np.array(SIZE_WH) * px_scale), axis=1)
     xy_a, xy_b = xy_a[inside], xy_b[inside]
     if name_a > name_b:
         name_a, name_b, xy_a, xy_b, b_from_a = name_b, name_a, xy_b, xy_a, np.linalg.inv(b_from_a)
@@ -47,7 +47,7 @@ def make_pair(name_a: str, name_b: str, b_from_a: np.ndarray, score: float = 0.9
     at_centre = np.einsum("nj,nj->n", homography[:, 2, :2], xy_a) + homography[:, 2, 2]
     return PairMatches(
         pair=ImagePair(name_a, name_b), xy0=xy_a, xy1=xy_b, score=np.full(len(xy_a), score),
-        homography=homography / at_centre[:, None, None], patch_radius_px=8.0 * px_per_unit,
+        homography=homography / at_centre[:, None, None], patch_radius_px=8.0 * px_scale,
     )  # fmt: skip
 
 
@@ -143,8 +143,8 @@ def test_a_keypoint_is_carried_back_through_the_inverse():
 
 def test_pixels_of_large_photos():
     """The same scene on photos of three times the matching resolution."""
-    photos = [make_photo("a", (120.0, 90.0), px_per_unit=3.0), make_photo("b", px_per_unit=3.0)]
-    keypoints, _, _ = persist(photos, [make_pair("a", "b", shift(15, 6), px_per_unit=3.0)])
+    photos = [make_photo("a", (120.0, 90.0), px_scale=3.0), make_photo("b", px_scale=3.0)]
+    keypoints, _, _ = persist(photos, [make_pair("a", "b", shift(15, 6), px_scale=3.0)])
     np.testing.assert_allclose(keypoints["a"].xy, [[120, 90]], atol=1e-2)
     np.testing.assert_allclose(keypoints["b"].xy, [[135, 96]], atol=1e-2)
 
@@ -153,7 +153,7 @@ def test_photos_of_two_resolutions():
     three_to_one = np.diag([1 / 3, 1 / 3, 1.0])
     pair = make_pair("a", "b", np.eye(3))
     pair = dataclasses.replace(pair, xy0=3 * pair.xy0, homography=pair.homography @ three_to_one, patch_radius_px=24.0)
-    keypoints, _, _ = persist([make_photo("a", (121.0, 90.5), px_per_unit=3.0), make_photo("b")], [pair])
+    keypoints, _, _ = persist([make_photo("a", (121.0, 90.5), px_scale=3.0), make_photo("b")], [pair])
     np.testing.assert_allclose(keypoints["a"].xy, [[121, 90.5]], atol=1e-2)
     np.testing.assert_allclose(keypoints["b"].xy, [[121 / 3, 90.5 / 3]], atol=1e-2)
 
@@ -339,7 +339,7 @@ def test_keypoints_end_at_exact_seeds():
 
 def test_anchors_are_the_nearest_exact_seeds_of_the_own_photo():
     photos = [
-        dataclasses.replace(make_photo("a", (10, 10), (30, 30), (50, 50), px_per_unit=2.0), seeds_are_exact=True),
+        dataclasses.replace(make_photo("a", (10, 10), (30, 30), (50, 50), px_scale=2.0), seeds_are_exact=True),
         make_photo("b", (10, 10)),
         dataclasses.replace(make_photo("c", (10, 10)), seeds_are_exact=True),
     ]
@@ -353,11 +353,11 @@ def test_anchors_are_the_nearest_exact_seeds_of_the_own_photo():
 def test_thinned_links_are_those_that_the_budget_keeps(scene):
     by_pair = {matches.pair: matches for matches in scene[1]}
     config = dataclasses.replace(CONFIG, max_keypoints=40)
-    linked = link_keypoints(scene[0], list(by_pair), by_pair.__getitem__, config, quiet=True)
-    thinned = thin_links(linked, config)
-    of_all, of_thinned = (sum(len(links.source) for links in of.links) for of in (linked, thinned))
+    graph = propagate_keypoints(scene[0], list(by_pair), by_pair.__getitem__, config, quiet=True)
+    thinned = prune_edges(graph, config)
+    of_all, of_thinned = (sum(len(links.source) for links in of.links) for of in (graph, thinned))
     assert 0 < of_thinned < 0.6 * of_all
-    (keypoints, matches), (few_keypoints, few_matches) = finish_keypoints(linked, config), finish_keypoints(thinned, config)
+    (keypoints, matches), (few_keypoints, few_matches) = finish_keypoints(graph, config), finish_keypoints(thinned, config)
     for found, again in zip(keypoints, few_keypoints, strict=True):
         np.testing.assert_allclose(found.xy, again.xy, atol=0.02)
     for found, again in zip(matches, few_matches, strict=True):
@@ -365,8 +365,8 @@ def test_thinned_links_are_those_that_the_budget_keeps(scene):
 
 
 def test_nothing_is_thinned_to_nothing():
-    linked = link_keypoints([make_photo("a")], [], {}.__getitem__, CONFIG, quiet=True)
-    assert thin_links(linked, CONFIG).links == ()
+    graph = propagate_keypoints([make_photo("a")], [], {}.__getitem__, CONFIG, quiet=True)
+    assert prune_edges(graph, CONFIG).links == ()
 
 
 # Parts
@@ -380,7 +380,7 @@ def test_the_budget_prefers_long_then_certain_tracks():
     length = np.bincount(label)[label]
     xy = np.tile([[5.0, 5.0]], (9, 1))
     for budget, kept in ((1, {0}), (2, {0, 2}), (3, {0, 2, 3}), (9, {0, 1, 2, 3}), (0, set())):
-        chosen = choose_budget(label, length, sigma, xy, image, budget)
+        chosen = select_keypoints(label, length, sigma, xy, image, budget)
         assert set(label[chosen].tolist()) == kept
         assert set(label[~chosen].tolist()).isdisjoint(kept), "whole tracks are kept"
 
@@ -388,13 +388,13 @@ def test_the_budget_prefers_long_then_certain_tracks():
 def test_the_budget_spreads_among_equals():
     # One image, 20 keypoints in one cell and one each in four others.
     xy = np.r_[np.full((20, 2), 5.0), [[40, 5], [70, 5], [5, 40], [5, 70]]]
-    chosen = choose_budget(np.arange(24), np.full(24, 2), np.ones(24), xy, np.zeros(24, int), 8)
+    chosen = select_keypoints(np.arange(24), np.full(24, 2), np.ones(24), xy, np.zeros(24, int), 8)
     assert chosen.sum() == 8 and chosen[20:].all()
 
 
 def test_the_budget_of_nothing():
     none = np.zeros(0, int)
-    assert len(choose_budget(none, none, np.zeros(0), np.zeros((0, 2)), none, 5)) == 0
+    assert len(select_keypoints(none, none, np.zeros(0), np.zeros((0, 2)), none, 5)) == 0
 
 
 def test_ranks_start_anew_in_every_group():
@@ -416,7 +416,7 @@ def test_doubtful_patches_carry_nothing_where_there_are_better_ones():
     sure, doubtful = make_pair("a", "b", shift(7, 0)), make_pair("a", "b", shift(12, 0), score=0.6)
     around = np.linalg.norm(sure.xy0 - (40, 30), axis=1) < 25
     sure = sure.select(np.repeat(np.flatnonzero(~around), 3))
-    assert len(sure) > CARRYING
+    assert len(sure) > MIN_PROPAGATING
     joined = {
         field: np.concatenate([getattr(sure, field), getattr(doubtful, field)])
         for field in ("xy0", "xy1", "score", "homography")

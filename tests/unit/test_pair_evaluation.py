@@ -24,8 +24,8 @@ K0 = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
 K1 = np.array([[450.0, 0, 300], [0, 450, 250], [0, 0, 1]])
 
 
-def make_pose(turn_deg, translation):
-    rotation, _ = cv2.Rodrigues(np.radians(turn_deg) * np.array([0.2, 1.0, 0.1]))
+def make_pose(rotation_deg, translation):
+    rotation, _ = cv2.Rodrigues(np.radians(rotation_deg) * np.array([0.2, 1.0, 0.1]))
     return np.column_stack([rotation, np.array(translation) / np.linalg.norm(translation)])
 
 

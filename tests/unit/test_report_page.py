@@ -11,7 +11,7 @@ import pytest
 
 from hm_sfm.config import Config
 from hm_sfm.report.diagnosis import Cause, Diagnosis
-from hm_sfm.report.gather import ImageFigures, Report, Scene, WeakPair
+from hm_sfm.report.gather import ImageMetrics, Report, Scene, WeakPair
 from hm_sfm.report.page import LABEL_LENGTH, MOST_LINKS, render_page, write_report
 from hm_sfm.types import ImagePair
 
@@ -46,7 +46,7 @@ class Balance(HTMLParser):
 def make_report(names=("a.jpg", "b.jpg", "c.jpg")) -> Report:
     """Three images, the last of which is not registered."""
     images = [
-        ImageFigures(
+        ImageMetrics(
             name=name, registered=True, keypoints=1200, observations=900, mean_error_px=0.25, neighbours=1, reason=""
         )
         for name in names

@@ -293,7 +293,7 @@ def test_choosing_pairs_encodes_only_where_looks_matter(ring, tmp_path, monkeypa
     monkeypatch.setattr("hm_sfm.pipeline.reconstruction.digest_image", lambda image: ring.digests[image.name])
     exhaustive = choose_pairs(ring.images, tmp_path / "out", Config(), quiet=True)
     assert len(exhaustive) == 60 * 59 // 2 and not asked and not (tmp_path / "out").exists()
-    pairing, matching = PairConfig(mode="retrieval", retrieval_top=4), MatchingConfig(retry_turned=False)
+    pairing, matching = PairConfig(mode="retrieval", retrieval_top=4), MatchingConfig(try_hypotheses=False)
     config = Config(pairs=pairing, matching=matching)
     pairs = choose_pairs(ring.images, tmp_path / "out", config, quiet=True)
     assert 120 <= len(pairs) <= 240 and len(ring.encoded) == 60

@@ -106,7 +106,7 @@ class CountingMatcher:
     """Encodes photos of 1 MB each and notes which."""
 
     def __init__(self, feature_cache_mb: int) -> None:
-        self.config = SimpleNamespace(feature_cache_mb=feature_cache_mb, engine="serial", retry_turned=False)
+        self.config = SimpleNamespace(feature_cache_mb=feature_cache_mb, engine="serial", try_hypotheses=False)
         self.images = SimpleNamespace(long_edge_px=64)
         self.encoded: list[str] = []
 

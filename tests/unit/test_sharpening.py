@@ -11,10 +11,10 @@ from hm_sfm.config import ImageConfig, KeypointConfig, MatchingConfig
 from hm_sfm.geometry.frames import homography_to_pixel_index
 from hm_sfm.errors import ConfigError
 from hm_sfm.photos.images import prepare_image, read_ref
-from hm_sfm.keypoints.propagation import Carried, LinkedKeypoints, Links, Photo, differentiate, finish_keypoints
+from hm_sfm.keypoints.propagation import PropagatedPoints, KeypointGraph, TrackEdges, Photo, differentiate, finish_keypoints
 from hm_sfm.network.fine import ExpectationHead
 from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.keypoints.refinement import encode_native, fit_variants, sharpen_links
+from hm_sfm.keypoints.refinement import encode_for_refinement, fit_hypotheses, refine_keypoints
 from hm_sfm.matching.store import digest_image
 from hm_sfm.types import apply_homographies
 
@@ -51,8 +51,8 @@ def photos(tmp_path_factory):
     return [read_ref(folder / f"{name}.png") for name in "ab"]
 
 
-def link_photos(photos, wrong: int = 0) -> LinkedKeypoints:
-    """Keypoints of both photos, half carried onward and half back, off by NOISE_PX; `wrong` ones by 40 px."""
+def link_photos(photos, wrong: int = 0) -> KeypointGraph:
+    """Keypoints of both photos, half propagated onward and half back, off by NOISE_PX; `wrong` ones by 40 px."""
     rng = np.random.default_rng(1)
     x, y = np.meshgrid(np.arange(80, 690, 30.0), np.arange(80, 500, 30.0))
     xy_a = np.stack([x.ravel(), y.ravel()], axis=1) + rng.uniform(-4, 4, (x.size, 2))
@@ -64,40 +64,40 @@ def link_photos(photos, wrong: int = 0) -> LinkedKeypoints:
     onward, back = index[:half], index[half:]
     known = [np.concatenate([xy_a[:half], (xy_a + noise)[half:]]), np.concatenate([(xy_b + noise)[:half], xy_b[half:]])]
 
-    def link(source, target, chosen, homography) -> Links:
+    def link(source, target, chosen, homography) -> TrackEdges:
         jacobian = differentiate(np.tile(homography, (len(chosen), 1, 1)), known[source][chosen])
         score = np.full(len(chosen), 0.7)
-        carried = Carried(chosen, np.full(len(chosen), -1), known[target][chosen] / UNIT, jacobian, score)
-        return Links(source, target, chosen, chosen, carried)
+        propagated = PropagatedPoints(chosen, np.full(len(chosen), -1), known[target][chosen] / UNIT, jacobian, score)
+        return TrackEdges(source, target, chosen, chosen, propagated)
 
     links = (link(0, 1, onward, B_FROM_A), link(1, 0, back, np.linalg.inv(B_FROM_A)))
     seen = tuple(Photo(photo.name, photo.size_wh, UNIT, np.zeros((0, 2))) for photo in photos)
-    return LinkedKeypoints(seen, tuple(xy / UNIT for xy in known), links)
+    return KeypointGraph(seen, tuple(xy / UNIT for xy in known), links)
 
 
-def sharpen(linked, photos, matcher, folder, made_by=None, native_px: int = SIZE_WH[0]) -> LinkedKeypoints:
+def sharpen(graph, photos, matcher, folder, made_by=None, refine_long_edge_px: int = SIZE_WH[0]) -> KeypointGraph:
     digests = {photo.name: digest_image(photo) for photo in photos}
-    return sharpen_links(linked, photos, matcher, native_px, folder / "native.h5", made_by or {}, digests, quiet=True)
+    return refine_keypoints(graph, photos, matcher, refine_long_edge_px, folder / "refined.h5", made_by or {}, digests, quiet=True)
 
 
-def measure_errors(linked: LinkedKeypoints) -> np.ndarray:
+def measure_errors(graph: KeypointGraph) -> np.ndarray:
     """How far the predictions of the keypoints are off, px of the photos; NaN where a link was given up."""
-    errors = np.full(len(linked.xy[0]), np.nan)
-    for links, homography in zip(linked.links, (B_FROM_A, np.linalg.inv(B_FROM_A))):
-        source, target = linked.photos[links.source_image], linked.photos[links.target_image]
-        truth = true_xy(homography, linked.xy[links.source_image][links.source] * source.px_per_unit)
-        errors[links.source] = np.linalg.norm(links.carried.predicted * target.px_per_unit - truth, axis=1)
+    errors = np.full(len(graph.xy[0]), np.nan)
+    for links, homography in zip(graph.links, (B_FROM_A, np.linalg.inv(B_FROM_A))):
+        source, target = graph.photos[links.source_image], graph.photos[links.target_image]
+        truth = true_xy(homography, graph.xy[links.source_image][links.source] * source.px_scale)
+        errors[links.source] = np.linalg.norm(links.propagated.predicted * target.px_scale - truth, axis=1)
     return errors
 
 
 @pytest.fixture
 def many(monkeypatch):
     """A pair has enough links."""
-    monkeypatch.setattr(sharpening, "LEAST_LINKS", 60)
+    monkeypatch.setattr(sharpening, "MIN_EDGES", 60)
 
 
 @pytest.fixture
-def sharpened(photos, matcher, tmp_path, many) -> LinkedKeypoints:
+def sharpened(photos, matcher, tmp_path, many) -> KeypointGraph:
     return sharpen(link_photos(photos, wrong=20), photos, matcher, tmp_path)
 
 
@@ -112,25 +112,25 @@ def test_predictions_get_sharper_in_both_directions(photos, sharpened):
 def test_jacobians_follow_the_plane(sharpened):
     links = sharpened.links[0]
     truth = differentiate(np.tile(B_FROM_A, (len(links.source), 1, 1)), sharpened.xy[0][links.source])
-    assert np.median(abs(links.carried.jacobian - truth)) < 0.02
+    assert np.median(abs(links.propagated.jacobian - truth)) < 0.02
 
 
 def test_units_are_those_of_the_photos(photos, sharpened):
-    assert [(photo.px_per_unit, photo.finer) for photo in sharpened.photos] == [(1.0, UNIT)] * 2
+    assert [(photo.px_scale, photo.finer) for photo in sharpened.photos] == [(1.0, UNIT)] * 2
     np.testing.assert_allclose(sharpened.xy[0], link_photos(photos, wrong=20).xy[0] * UNIT)
 
 
 def test_wrong_predictions_are_given_up(sharpened):
     given_up = np.isnan(measure_errors(sharpened))
     assert given_up[:20].all() and given_up[20:].mean() < 0.1
-    assert np.median(sharpened.links[0].carried.score) > 0.5
+    assert np.median(sharpened.links[0].propagated.score) > 0.5
 
 
 def test_where_few_are_right_the_best_stay_and_wrong_ones_count_less(photos, matcher, tmp_path, many):
-    linked = link_photos(photos, wrong=20)
-    first = linked.links[0]
-    linked = dataclasses.replace(linked, links=(first.select(first.source < 60),))
-    before, after = first.carried, sharpen(linked, photos, matcher, tmp_path).links[0].carried
+    graph = link_photos(photos, wrong=20)
+    first = graph.links[0]
+    graph = dataclasses.replace(graph, links=(first.select(first.source < 60),))
+    before, after = first.propagated, sharpen(graph, photos, matcher, tmp_path).links[0].propagated
     np.testing.assert_array_equal(after.point, np.arange(60))
     np.testing.assert_allclose(after.predicted[:20], before.predicted[:20] * UNIT)
     assert (after.score[:20] < 0.5 * before.score[:20]).all()
@@ -146,31 +146,31 @@ def test_the_keypoints_of_tracks_end_where_they_should(photos, sharpened):
 
 
 def test_photos_of_the_matching_resolution_keep_their_units(photos, matcher, tmp_path, many):
-    linked = link_photos(photos)
-    small = tuple(dataclasses.replace(photo, px_per_unit=1.0) for photo in linked.photos)
-    xy = tuple(xy * UNIT for xy in linked.xy)
+    graph = link_photos(photos)
+    small = tuple(dataclasses.replace(photo, px_scale=1.0) for photo in graph.photos)
+    xy = tuple(xy * UNIT for xy in graph.xy)
     links = tuple(
-        dataclasses.replace(part, carried=dataclasses.replace(part.carried, predicted=part.carried.predicted * UNIT))
-        for part in linked.links
+        dataclasses.replace(part, propagated=dataclasses.replace(part.propagated, predicted=part.propagated.predicted * UNIT))
+        for part in graph.links
     )
-    result = sharpen(LinkedKeypoints(small, xy, links), photos, matcher, tmp_path)
+    result = sharpen(KeypointGraph(small, xy, links), photos, matcher, tmp_path)
     assert [photo.finer for photo in result.photos] == [1.0, 1.0]
-    before, after = measure_errors(linked), measure_errors(result)
+    before, after = measure_errors(graph), measure_errors(result)
     near = before < 0.6
     assert np.nanmedian(after[near]) < 0.5 * np.median(before[near])
     assert np.isnan(after[before > 1.2]).all()
 
 
 def test_what_was_done_is_not_done_again_and_other_links_are(photos, matcher, tmp_path, monkeypatch):
-    linked = link_photos(photos)
-    first = sharpen(linked, photos, matcher, tmp_path)
+    graph = link_photos(photos)
+    first = sharpen(graph, photos, matcher, tmp_path)
     encoded = []
-    encode = sharpening.encode_native
-    monkeypatch.setattr(sharpening, "encode_native", lambda *args: encoded.append(args) or encode(*args))
-    again = sharpen(linked, photos, matcher, tmp_path)
+    encode = sharpening.encode_for_refinement
+    monkeypatch.setattr(sharpening, "encode_for_refinement", lambda *args: encoded.append(args) or encode(*args))
+    again = sharpen(graph, photos, matcher, tmp_path)
     assert not encoded
     for a, b in zip(first.links, again.links):
-        np.testing.assert_array_equal(a.carried.predicted, b.carried.predicted)
+        np.testing.assert_array_equal(a.propagated.predicted, b.propagated.predicted)
     sharpen(link_photos(photos, wrong=5), photos, matcher, tmp_path)
     assert len(encoded) == 2
     sharpen(link_photos(photos, wrong=5), photos, matcher, tmp_path, {"weights": "others"})
@@ -179,22 +179,22 @@ def test_what_was_done_is_not_done_again_and_other_links_are(photos, matcher, tm
 
 def test_strips_make_the_features_of_the_whole(photos, matcher, monkeypatch):
     image = prepare_image(photos[0], SIZE_WH[0])
-    whole = encode_native(matcher, image)
+    whole = encode_for_refinement(matcher, image)
     monkeypatch.setattr(sharpening, "STRIP_PX", 512)
-    strips = encode_native(matcher, image)
+    strips = encode_for_refinement(matcher, image)
     assert strips.fine.size_wh == whole.fine.size_wh == (SIZE_WH[0] // 2, SIZE_WH[1] // 2)
     off = (strips.fine.cells - whole.fine.cells).abs().float()
     assert off.mean() < 0.01 * whole.fine.cells.abs().float().mean()
 
 
-@pytest.mark.parametrize("turn_deg", [0, 90, 180, 270])
+@pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])
 @pytest.mark.parametrize("scale", [0.3, 0.9, 1.2, 2.2])
-def test_photos_are_shown_upright_and_in_one_scale(turn_deg, scale):
-    angle = np.deg2rad(turn_deg + 12)
+def test_photos_are_shown_upright_and_in_one_scale(rotation_deg, scale):
+    angle = np.deg2rad(rotation_deg + 12)
     linear = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    variant0, variant1 = fit_variants(np.tile(linear, (5, 1, 1)))
-    assert (turn_deg + variant1.turn_deg) % 360 == 0 and variant0.turn_deg == 0
-    assert (variant0.reduction, variant1.reduction) == {0.3: (4, 1), 0.9: (1, 1), 1.2: (1, 1), 2.2: (1, 2)}[scale]
+    hypothesis0, hypothesis1 = fit_hypotheses(np.tile(linear, (5, 1, 1)))
+    assert (rotation_deg + hypothesis1.rotation_deg) % 360 == 0 and hypothesis0.rotation_deg == 0
+    assert (hypothesis0.downscale, hypothesis1.downscale) == {0.3: (4, 1), 0.9: (1, 1), 1.2: (1, 1), 2.2: (1, 2)}[scale]
 
 
 def test_a_photo_on_its_side_and_twice_as_large_gets_sharper_too(photos, matcher, tmp_path):
@@ -203,28 +203,28 @@ def test_a_photo_on_its_side_and_twice_as_large_gets_sharper_too(photos, matcher
     turned = [photos[0], read_ref(tmp_path / "b.png")]
     width = 2 * SIZE_WH[1]
     turned_from_b = np.array([[0, -2, width], [2, 0, 0], [0, 0, 1.0]])
-    linked = link_photos(turned)
-    links = linked.links[0]
-    xy_a = linked.xy[0][links.source] * UNIT
+    graph = link_photos(turned)
+    links = graph.links[0]
+    xy_a = graph.xy[0][links.source] * UNIT
     homography = turned_from_b @ B_FROM_A
     truth = true_xy(homography, xy_a)
     off = truth + np.random.default_rng(2).normal(0, 2 * NOISE_PX, truth.shape)
     jacobian = differentiate(np.tile(homography, (len(xy_a), 1, 1)), xy_a)
-    carried = dataclasses.replace(links.carried, predicted=off / UNIT, jacobian=jacobian)
-    linked = dataclasses.replace(linked, links=(dataclasses.replace(links, carried=carried),))
-    after = sharpen(linked, turned, matcher, tmp_path, native_px=2 * SIZE_WH[0]).links[0].carried
+    propagated = dataclasses.replace(links.propagated, predicted=off / UNIT, jacobian=jacobian)
+    graph = dataclasses.replace(graph, links=(dataclasses.replace(links, propagated=propagated),))
+    after = sharpen(graph, turned, matcher, tmp_path, refine_long_edge_px=2 * SIZE_WH[0]).links[0].propagated
     errors = np.linalg.norm(after.predicted - truth[after.point], axis=1)
     assert np.median(errors) < 0.3 * np.median(np.linalg.norm(off - truth, axis=1))
     assert np.median(after.score) > 0.3
 
 
 def test_no_links_at_all(photos, matcher, tmp_path):
-    linked = dataclasses.replace(link_photos(photos), links=())
-    assert sharpen(linked, photos, matcher, tmp_path).links == ()
+    graph = dataclasses.replace(link_photos(photos), links=())
+    assert sharpen(graph, photos, matcher, tmp_path).links == ()
 
 
 def test_an_expectation_head_is_refused(photos, matcher, tmp_path):
     net = HomoMatcher.from_pretrained("light_expectation").net
     assert isinstance(net.head, ExpectationHead)
-    with pytest.raises(ConfigError, match="keypoints.native_px needs network.head homography"):
+    with pytest.raises(ConfigError, match="keypoints.refine_long_edge_px needs network.head homography"):
         sharpen(link_photos(photos), photos, HomoMatcher(net, matcher.config, matcher.images), tmp_path)

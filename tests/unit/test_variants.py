@@ -18,19 +18,19 @@ from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.synthetic.textures import MATERIALS, make_texture
 from hm_sfm.types import ImagePair, PatchMatches, apply_homographies
 from hm_sfm.matching.hypotheses import (
-    AS_THEY_ARE,
+    UNCHANGED,
     FEW_MATCHES,
     SCALES,
-    TURNS,
-    UPRIGHT,
+    ROTATIONS,
+    IDENTITY,
     Sketch,
-    Variant,
-    choose_variants,
+    Hypothesis,
+    choose_hypotheses,
     count_agreeing,
     count_good,
     place_cells,
     relate_scales,
-    show_image,
+    apply_hypothesis,
 )
 
 SHIFT = np.array([[1, 0, -13], [0, 1, -9], [0, 0, 1.0]])
@@ -80,11 +80,11 @@ def matcher() -> HomoMatcher:
 @pytest.fixture(scope="module")
 def upright(matcher) -> HomoMatcher:
     """The same one, that tries nothing else."""
-    return HomoMatcher(matcher.net, MatchingConfig(retry_turned=False), ImageConfig())
+    return HomoMatcher(matcher.net, MatchingConfig(try_hypotheses=False), ImageConfig())
 
 
-def turn(image: np.ndarray, turn_deg: int) -> np.ndarray:
-    return cv2.rotate(image, CV_ROTATIONS[turn_deg])
+def turn(image: np.ndarray, rotation_deg: int) -> np.ndarray:
+    return cv2.rotate(image, CV_ROTATIONS[rotation_deg])
 
 
 def measure_errors(matches: PatchMatches, truth: np.ndarray) -> np.ndarray:
@@ -99,15 +99,15 @@ def assert_right(matches: PatchMatches, truth: np.ndarray, least: int) -> None:
     assert len(good) >= least
     assert (measure_errors(good, truth) < 1).mean() > 0.95
     corner = good.xy0 + 0.7 * good.patch_radius_px
-    carried = apply_homographies(good.homography, corner)
+    propagated = apply_homographies(good.homography, corner)
     expected = apply_homographies(np.broadcast_to(truth, (len(good), 3, 3)), corner)
-    assert np.median(np.linalg.norm(carried - expected, axis=1)) < 0.5
+    assert np.median(np.linalg.norm(propagated - expected, axis=1)) < 0.5
 
 
-@pytest.mark.parametrize("turn_deg", CV_ROTATIONS)
-def test_turned_photos_match_as_upright_ones_do(matcher, upright, photo, other, turn_deg):
-    truth = rotation_matrix((256, 191), turn_deg) @ SHIFT
-    turned = turn(other, turn_deg)
+@pytest.mark.parametrize("rotation_deg", CV_ROTATIONS)
+def test_turned_photos_match_as_upright_ones_do(matcher, upright, photo, other, rotation_deg):
+    truth = rotation_matrix((256, 191), rotation_deg) @ SHIFT
+    turned = turn(other, rotation_deg)
     alone = upright.match(photo, turned)
     assert np.count_nonzero(measure_errors(alone, truth) < 1) < 10
     assert_right(matcher.match(photo, turned), truth, 350)
@@ -143,7 +143,7 @@ def test_nothing_to_see(matcher, photo):
         matches = matcher.match(*pair)
         assert np.isfinite(matches.homography).all() and count_good(matches) < 100
         sketches = [Sketch(matcher, prepare_array(image, 1024)) for image in pair]
-        assert choose_variants(matcher, *sketches) is None
+        assert choose_hypotheses(matcher, *sketches) is None
 
 
 @pytest.fixture
@@ -186,51 +186,51 @@ def test_given_matches_of_turned_photos_become_homographies(matcher, folder, tmp
     config = MatchingConfig(coarse_matches=str(tmp_path / "points.h5"))
     given = HomoMatcher(matcher.net, config, ImageConfig())
     assert_right(given.match(folder / "a.png", folder / "b.png"), truth, len(xy0) // 2)
-    config = dataclasses.replace(config, retry_turned=False)
+    config = dataclasses.replace(config, try_hypotheses=False)
     alone = HomoMatcher(matcher.net, config, ImageConfig()).match(folder / "a.png", folder / "b.png")
     assert count_good(alone) < len(xy0) // 4
 
 
-@pytest.mark.parametrize("turn_deg", [0, *CV_ROTATIONS])
-@pytest.mark.parametrize("reduction", [1, 2])
-def test_points_of_a_variant_are_those_of_the_stored_photo(turn_deg, reduction):
+@pytest.mark.parametrize("rotation_deg", [0, *CV_ROTATIONS])
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_points_of_a_variant_are_those_of_the_stored_photo(rotation_deg, downscale):
     blocks = np.random.default_rng(0).integers(0, 255, (24, 40), np.uint8)
     image = prepare_array(np.kron(blocks, np.ones((2, 2), np.uint8)), 1024)
-    shown = show_image(image, Variant(turn_deg, reduction))
+    shown = apply_hypothesis(image, Hypothesis(rotation_deg, downscale))
     row, column = np.indices(shown.grey.shape).reshape(2, -1)
     stored = np.column_stack([column + 0.5, row + 0.5, np.ones(len(row))]) @ shown.stored_from_scaled.T
     x, y = (stored[:, :2] / 2).astype(int).T
     np.testing.assert_allclose(shown.grey[row, column] * 255, blocks[y, x], atol=1e-3)
-    assert shown.ref.rotation_deg == turn_deg
-    again = show_image(shown, Variant(-turn_deg % 360))
+    assert shown.ref.rotation_deg == rotation_deg
+    again = apply_hypothesis(shown, Hypothesis(-rotation_deg % 360))
     assert again.ref.rotation_deg == 0
-    np.testing.assert_allclose(again.stored_from_scaled, np.diag([reduction, reduction, 1]))
+    np.testing.assert_allclose(again.stored_from_scaled, np.diag([downscale, downscale, 1]))
 
 
 def test_the_photo_as_it_is_is_not_touched(photo):
     image = prepare_array(photo, 1024)
-    assert show_image(image, UPRIGHT) is image
+    assert apply_hypothesis(image, IDENTITY) is image
 
 
 def test_providers_that_read_the_photo_read_it_turned(tmp_path):
     colours = np.random.default_rng(0).integers(0, 255, (48, 80, 3), np.uint8)
     cv2.imwrite(str(tmp_path / "a.png"), colours)
     image = prepare_image(read_ref(tmp_path / "a.png"), 1024)
-    np.testing.assert_array_equal(read_rgb(show_image(image, Variant(270))), turn(read_rgb(image), 270))
+    np.testing.assert_array_equal(read_rgb(apply_hypothesis(image, Hypothesis(270))), turn(read_rgb(image), 270))
 
 
 def test_each_way_is_compared_once():
-    ways = TURNS + SCALES
-    assert ways[0] == AS_THEY_ARE and len(ways) == len(set(ways)) == 4 + 4 * 4
-    assert all(variant0.turn_deg == 0 and 1 in (variant0.reduction, variant1.reduction) for variant0, variant1 in ways)
+    ways = ROTATIONS + SCALES
+    assert ways[0] == UNCHANGED and len(ways) == len(set(ways)) == 4 + 4 * 4
+    assert all(hypothesis0.rotation_deg == 0 and 1 in (hypothesis0.downscale, hypothesis1.downscale) for hypothesis0, hypothesis1 in ways)
 
 
 def test_scales_of_sketches_are_scales_of_photos():
-    reduced = Variant(90, 2)
-    assert relate_scales((UPRIGHT, reduced), 2.5, 2.5) == (UPRIGHT, reduced)
-    assert relate_scales((UPRIGHT, UPRIGHT), 2.5, 1.0) == (Variant(0, 2.5), UPRIGHT)
-    assert relate_scales((UPRIGHT, Variant(180, 3)), 2.0, 1.0) == (UPRIGHT, Variant(180, 1.5))
-    assert relate_scales((UPRIGHT, reduced), 2.0, 1.2) == (UPRIGHT, Variant(90))
+    reduced = Hypothesis(90, 2)
+    assert relate_scales((IDENTITY, reduced), 2.5, 2.5) == (IDENTITY, reduced)
+    assert relate_scales((IDENTITY, IDENTITY), 2.5, 1.0) == (Hypothesis(0, 2.5), IDENTITY)
+    assert relate_scales((IDENTITY, Hypothesis(180, 3)), 2.0, 1.0) == (IDENTITY, Hypothesis(180, 1.5))
+    assert relate_scales((IDENTITY, reduced), 2.0, 1.2) == (IDENTITY, Hypothesis(90))
 
 
 def test_matches_agree_with_those_around_them():

@@ -11,9 +11,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NoReturn
 
-from hm_sfm.io.atomic import replace_file
 from hm_sfm.config import Config, load_config
 from hm_sfm.errors import HmSfmError, InputError, NoModelError
+from hm_sfm.io.atomic import replace_file
 
 EXAMPLES = """examples:
   hm-sfm demo out/demo                     render a small scene, reconstruct it, compare with the truth
@@ -285,8 +285,8 @@ def read_config(options: argparse.Namespace) -> Config:
 
 
 def run_match(options: argparse.Namespace) -> int:
-    from hm_sfm.pipeline.reconstruction import match_photos
     from hm_sfm.matching.shards import Shard
+    from hm_sfm.pipeline.reconstruction import match_photos
 
     shard = None if options.shard is None else Shard.parse(options.shard)
     matched = match_photos(options.images, options.out, read_config(options), options.quiet, shard)
@@ -379,9 +379,9 @@ def run_frames(options: argparse.Namespace) -> int:
 
 
 def run_demo(options: argparse.Namespace) -> int:
-    from hm_sfm.synthetic.demo import write_demo
     from hm_sfm.evaluation.poses import read_strecha_cameras, score_model
     from hm_sfm.pipeline.reconstruction import claim_folder, reconstruct
+    from hm_sfm.synthetic.demo import write_demo
 
     claim_folder(options.out)
     write_demo(options.out)
@@ -415,10 +415,15 @@ def run_show(options: argparse.Namespace) -> int:
 
 
 def run_evaluate(options: argparse.Namespace) -> int:
-    from hm_sfm.report.drawn_matches import MatchPictures
-    from hm_sfm.matching.matcher import HomoMatcher
-    from hm_sfm.evaluation.relative_poses import read_strecha_pairs, read_superglue_pairs, score_homographies, score_poses
     from hm_sfm.evaluation.points import score_points
+    from hm_sfm.evaluation.relative_poses import (
+        read_strecha_pairs,
+        read_superglue_pairs,
+        score_homographies,
+        score_poses,
+    )
+    from hm_sfm.matching.matcher import HomoMatcher
+    from hm_sfm.report.drawn_matches import MatchPictures
     from hm_sfm.training.photos import load_photos
     from hm_sfm.training.validation import make_validation_pairs
 

@@ -18,14 +18,23 @@ from functools import partial
 from pathlib import Path
 
 from ablation_scores import (
-    CELLS, POINTS, Scores, Trial, describe_trial, drop_head, drop_transformer, prepare_trial, score_matches, score_net,
+    CELLS,
+    POINTS,
+    Scores,
+    Trial,
+    describe_trial,
+    drop_head,
+    drop_transformer,
+    prepare_trial,
+    score_matches,
+    score_net,
     score_once,
 )  # fmt: skip
 from tables import format_markdown
 
-from hm_sfm.io.atomic import replace_file
 from hm_sfm.config import load_config
 from hm_sfm.errors import ConfigError, HmSfmError
+from hm_sfm.io.atomic import replace_file
 from hm_sfm.matching.matcher import digest_weights, load_weights
 from hm_sfm.training.loop import TrainConfig, train
 
@@ -46,7 +55,9 @@ def ablate(config: TrainConfig, scene: Path, attention_weights: Path | None) -> 
     sizes = {"expectation": score_variant(expectation, trial)}
     for w, r, k, spacing in SIZES:
         network = replace(config.network, window=w, radius=r, iterations=k, spacing=spacing)
-        sizes[f"{w}/{r}/{k}" + f", spacing {spacing}" * (spacing > 1)] = score_variant(replace(config, network=network), trial)
+        sizes[f"{w}/{r}/{k}" + f", spacing {spacing}" * (spacing > 1)] = score_variant(
+            replace(config, network=network), trial
+        )
     tables = {
         "What supervises the fine stage": format_markdown(losses, POINTS),
         "The size of the fine stage: w/r/K": format_markdown(sizes, (*POINTS, "fine ms")),

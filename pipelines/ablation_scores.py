@@ -13,12 +13,12 @@ import torch
 from tables import write_json
 from torch import Tensor
 
-from hm_sfm.io.atomic import replace_file
 from hm_sfm.config import ImageConfig, MatchingConfig, fingerprint
-from hm_sfm.photos.images import prepare_image, read_ref
-from hm_sfm.network.fine import make_fine_map
-from hm_sfm.matching.matcher import FINE_CHUNK, HomoMatcher, HomoNet, autocast, pad_image, read_checkpoint
 from hm_sfm.evaluation.relative_poses import PosePair, read_strecha_pairs, score_poses
+from hm_sfm.io.atomic import replace_file
+from hm_sfm.matching.matcher import FINE_CHUNK, HomoMatcher, HomoNet, autocast, pad_image, read_checkpoint
+from hm_sfm.network.fine import make_fine_map
+from hm_sfm.photos.images import prepare_image, read_ref
 from hm_sfm.training.loop import TrainConfig, run_fingerprint
 from hm_sfm.training.losses import DENSE_RADIUS
 from hm_sfm.training.mixture import MixedPairs, collate_pairs
@@ -126,7 +126,8 @@ def score_matches(net: HomoNet, trial: Trial) -> Scores:
 
 def measure_matches(matcher: HomoMatcher, pair: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Errors, px, of the matches of a pair with known surfaces: of the pixels within r_e of a patch's centre, (N,), and
-    of the centres, (M,). What view B does not show is left out; a wrong coarse match counts by all its points."""
+    of the centres, (M,). What view B does not show is left out; a wrong coarse match counts by all its points.
+    """
     height, width = pair["surface"].shape
 
     def measure(xy0: np.ndarray, xy1: np.ndarray) -> np.ndarray:
@@ -144,7 +145,8 @@ def measure_matches(matcher: HomoMatcher, pair: dict[str, np.ndarray]) -> tuple[
 
 def time_stages(matcher: HomoMatcher, pair: PosePair) -> Scores:
     """Milliseconds of the coarse stage of a pair of photos, and of the fine stage for TIMED_PATCHES patches, in chunks
-    as they are matched. The backbone, which runs once an image, counts in neither."""
+    as they are matched. The backbone, which runs once an image, counts in neither.
+    """
     net, device = matcher.net, matcher.device
     backbone, head = net.backbone, net.head
     generator = torch.Generator().manual_seed(0)

@@ -17,10 +17,10 @@ import numpy as np
 import pycolmap
 from tables import format_table
 
-from hm_sfm.photos.images import list_images
 from hm_sfm.matching.matcher import HomoMatcher, digest_weights
-from hm_sfm.pairs.retrieval import CellStore, describe_images, find_similar
 from hm_sfm.matching.store import digest_image
+from hm_sfm.pairs.retrieval import CellStore, describe_images, find_similar
+from hm_sfm.photos.images import list_images
 from hm_sfm.types import ImagePair, ImageRef
 
 

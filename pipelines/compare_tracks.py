@@ -12,17 +12,23 @@ from pathlib import Path
 
 import numpy as np
 
-from hm_sfm.evaluation.comparison import load_expectation, load_matcher, read_tracks
-from hm_sfm.config import Config
 from hm_sfm.colmap.database import make_cameras, write_database
-from hm_sfm.evaluation.poses import read_strecha_cameras, score_model
-from hm_sfm.photos.images import list_images
-from hm_sfm.evaluation.loftr_style import make_keypoints
 from hm_sfm.colmap.mapping import map_incrementally, summarise_models
-from hm_sfm.matching.run import match_pairs
-from hm_sfm.pipeline.reconstruction import persist_verified, choose_pairs, claim_folder, describe_matching, measure_px_scales
-from hm_sfm.matching.store import MatchStore, digest_image
 from hm_sfm.colmap.verification import verify_database, verify_pairs
+from hm_sfm.config import Config
+from hm_sfm.evaluation.comparison import load_expectation, load_matcher, read_tracks
+from hm_sfm.evaluation.loftr_style import make_keypoints
+from hm_sfm.evaluation.poses import read_strecha_cameras, score_model
+from hm_sfm.matching.run import match_pairs
+from hm_sfm.matching.store import MatchStore, digest_image
+from hm_sfm.photos.images import list_images
+from hm_sfm.pipeline.reconstruction import (
+    choose_pairs,
+    claim_folder,
+    describe_matching,
+    measure_px_scales,
+    persist_verified,
+)
 
 
 def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:

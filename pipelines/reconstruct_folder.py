@@ -8,14 +8,14 @@ Writes OUT/matches.h5, OUT/database.db and OUT/sparse. Started again, it keeps t
 import sys
 from pathlib import Path
 
-from hm_sfm.config import Config
 from hm_sfm.colmap.database import make_cameras, write_database
-from hm_sfm.photos.images import list_images
 from hm_sfm.colmap.mapping import map_incrementally, summarise_models
-from hm_sfm.matching.run import match_pairs
-from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.pipeline.reconstruction import persist_verified, choose_pairs, claim_folder, measure_px_scales, open_store
 from hm_sfm.colmap.verification import verify_database, verify_pairs
+from hm_sfm.config import Config
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.matching.run import match_pairs
+from hm_sfm.photos.images import list_images
+from hm_sfm.pipeline.reconstruction import choose_pairs, claim_folder, measure_px_scales, open_store, persist_verified
 
 
 def reconstruct_folder(photos: Path, out: Path) -> None:

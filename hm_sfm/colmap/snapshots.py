@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from hm_sfm.io.atomic import move_folder
-from hm_sfm.config import MappingConfig, fingerprint
 from hm_sfm.colmap.database import open_database
+from hm_sfm.config import MappingConfig, fingerprint
+from hm_sfm.io.atomic import move_folder
 
 SNAPSHOT_FOLDER = "snapshots"
 
@@ -26,7 +26,8 @@ class Snapshots:
 
     def __init__(self, folder: Path, growing: Path, made_from: str) -> None:
         """folder: of finished snapshots, which may be missing. growing: a new folder, on the same disk, that COLMAP
-        writes to. made_from: a fingerprint; snapshots of another one are not used."""
+        writes to. made_from: a fingerprint; snapshots of another one are not used.
+        """
         self.folder, self.growing, self.made_from = Path(folder), Path(growing), made_from
         self.growing.mkdir()
         found = {int(path.suffix[1:]): path for path in self.folder.glob(f"{made_from}.*")}

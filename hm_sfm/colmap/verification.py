@@ -12,9 +12,9 @@ import numpy as np
 import pycolmap
 from tqdm import tqdm
 
+from hm_sfm.colmap.database import open_database
 from hm_sfm.colmap.models import quiet_colmap
 from hm_sfm.config import VerificationConfig
-from hm_sfm.colmap.database import open_database
 from hm_sfm.types import ImagePair, ImageRef, PairMatches, freeze_array
 
 # Fewer matches than this prove nothing about an epipolar geometry.

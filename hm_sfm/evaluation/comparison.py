@@ -18,27 +18,34 @@ import numpy as np
 import pycolmap
 from tqdm import tqdm
 
-from hm_sfm.io.atomic import replace_file
-from hm_sfm.matching.coarse_matches import check_coarse
-from hm_sfm.config import Config, fingerprint
 from hm_sfm.colmap.database import Cameras, make_cameras, open_database, write_database
+from hm_sfm.colmap.mapping import choose_mapper, map_images, summarise_models
+from hm_sfm.colmap.verification import verify_database
+from hm_sfm.config import Config, fingerprint
 from hm_sfm.errors import ConfigError, InputError, NoModelError
-from hm_sfm.evaluation.poses import read_strecha_cameras, score_model
-from hm_sfm.formats.hloc import read_features, read_matches
-from hm_sfm.photos.images import list_images
-from hm_sfm.io.locks import release_locks
 from hm_sfm.evaluation.loftr import LoftrMatcher
 from hm_sfm.evaluation.loftr_style import make_keypoints
-from hm_sfm.colmap.mapping import choose_mapper, map_images, summarise_models
-from hm_sfm.photos.masks import NO_MASKS, MaskedStore, Masks, read_masks
-from hm_sfm.matching.run import match_pairs
-from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.pairs.selection import write_pairs
-from hm_sfm.pipeline.reconstruction import choose_pairs, claim_folder, describe_matching, measure_px_scales, reconstruct, stopwatch
-from hm_sfm.matching.store import MatchStore, digest_image
+from hm_sfm.evaluation.poses import read_strecha_cameras, score_model
+from hm_sfm.formats.hloc import read_features, read_matches
+from hm_sfm.io.atomic import replace_file
+from hm_sfm.io.locks import release_locks
 from hm_sfm.keypoints.tracks import build_tracks, label_tracks, read_tracks
+from hm_sfm.matching.coarse_matches import check_coarse
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.matching.run import match_pairs
+from hm_sfm.matching.store import MatchStore, digest_image
+from hm_sfm.pairs.selection import write_pairs
+from hm_sfm.photos.images import list_images
+from hm_sfm.photos.masks import NO_MASKS, MaskedStore, Masks, read_masks
+from hm_sfm.pipeline.reconstruction import (
+    choose_pairs,
+    claim_folder,
+    describe_matching,
+    measure_px_scales,
+    reconstruct,
+    stopwatch,
+)
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, PinholeView, Tracks
-from hm_sfm.colmap.verification import verify_database
 
 CELLS_PX = (1, 2, 4, 8)
 """Cells that LoFTR-style matches are snapped to."""

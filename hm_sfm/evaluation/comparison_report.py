@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hm_sfm.io.atomic import replace_file
-from hm_sfm.evaluation.comparison import AUC_SHOWN_DEG, Comparison, MethodResult
 from hm_sfm.errors import MissingPackageError
+from hm_sfm.evaluation.comparison import AUC_SHOWN_DEG, Comparison, MethodResult
+from hm_sfm.io.atomic import replace_file
 
 STAGES = ("match", "keypoints", "verify", "map")
 LINE_STYLES = ("-", "--", ":", "-.")

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from hm_sfm.config import ImageConfig, MatchingConfig
 from hm_sfm.errors import MissingPackageError
-from hm_sfm.photos.images import PreparedImage
 from hm_sfm.matching.matcher import digest_weights, fit_state, is_inside, pad_image, pick_device, read_checkpoint
+from hm_sfm.photos.images import PreparedImage
 from hm_sfm.types import PatchMatches
 
 STRIDE = 8

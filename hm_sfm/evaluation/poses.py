@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from hm_sfm.io.atomic import replace_file
 from hm_sfm.errors import InputError
+from hm_sfm.io.atomic import replace_file
 from hm_sfm.types import PinholeView
 
 AUC_THRESHOLDS_DEG = (0.25, 0.5, 1, 3, 5, 10, 20)

@@ -13,11 +13,17 @@ import numpy as np
 import pycolmap
 from tqdm import tqdm
 
-from hm_sfm.geometry.frames import homography_from_pixel_index
 from hm_sfm.errors import InputError
-from hm_sfm.evaluation.poses import measure_angle_deg, measure_rotation_deg, pose_auc, read_strecha_cameras, relative_pose
-from hm_sfm.photos.images import prepare_image, read_ref
+from hm_sfm.evaluation.poses import (
+    measure_angle_deg,
+    measure_rotation_deg,
+    pose_auc,
+    read_strecha_cameras,
+    relative_pose,
+)
+from hm_sfm.geometry.frames import homography_from_pixel_index
 from hm_sfm.matching.matcher import HomoMatcher, ImageFeatures
+from hm_sfm.photos.images import prepare_image, read_ref
 from hm_sfm.types import PatchMatches, freeze_array
 
 POSE_THRESHOLDS_DEG = (5, 10, 20)

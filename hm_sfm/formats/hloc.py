@@ -14,10 +14,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from hm_sfm.io.atomic import replace_file
-from hm_sfm.geometry.frames import pixel_index_from_px, px_from_pixel_index
 from hm_sfm.errors import InputError
 from hm_sfm.evaluation.loftr_style import keep_best
+from hm_sfm.geometry.frames import pixel_index_from_px, px_from_pixel_index
+from hm_sfm.io.atomic import replace_file
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 SEPARATORS = ("/", "_")
@@ -163,7 +163,7 @@ def read_pair(
 
 
 def name_group(name0: str, name1: str, separator: str = "/") -> str:
-    """hloc's name of a pair."""
+    """Hloc's name of a pair."""
     return f"{name0.replace('/', '-')}{separator}{name1.replace('/', '-')}"
 
 

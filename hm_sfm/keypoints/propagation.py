@@ -16,13 +16,13 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from hm_sfm.keypoints.adjustment import Anchors, adjust_keypoints, measure_residuals, weigh_scores
-from hm_sfm.keypoints.selection import select_keypoints
 from hm_sfm.config import KeypointConfig
 from hm_sfm.geometry.frames import px_from_pixel_index
-from hm_sfm.photos.images import PreparedImage
 from hm_sfm.geometry.nearest import find_nearest, find_pairs_within
+from hm_sfm.keypoints.adjustment import Anchors, adjust_keypoints, measure_residuals, weigh_scores
+from hm_sfm.keypoints.selection import select_keypoints
 from hm_sfm.keypoints.tracks import label_tracks, measure_lengths
+from hm_sfm.photos.images import PreparedImage
 from hm_sfm.types import ImagePair, IndexMatches, Keypoints, PairMatches, apply_homographies
 
 SEED_CELL_PX = 8
@@ -328,7 +328,9 @@ def propagate_keypoints(
         transfers = make_transfers(matches, *(photos[i].px_scale for i in ends))
         turn = strength[ends[1]] > strength[ends[0]]
         first, second = ends[::-1] if turn else ends
-        links += propagate_pair(first, second, transfers[::-1] if turn else transfers, photos, growing, seeds[first], config)
+        links += propagate_pair(
+            first, second, transfers[::-1] if turn else transfers, photos, growing, seeds[first], config
+        )
     return KeypointGraph(tuple(photos), tuple(keypoints.xy for keypoints in growing), tuple(links))
 
 

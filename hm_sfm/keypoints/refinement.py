@@ -20,12 +20,10 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from hm_sfm.io.batches import store_in_batches
 from hm_sfm.errors import ConfigError, StaleResultError
-from hm_sfm.photos.images import PreparedImage, prepare_image
-from hm_sfm.keypoints.propagation import KeypointGraph, TrackEdges, Photo, choose_good, differentiate
-from hm_sfm.network.fine import FineMap, HomographyHead, make_fine_map
-from hm_sfm.network.homography import is_regular
+from hm_sfm.io.batches import store_in_batches
+from hm_sfm.keypoints.propagation import KeypointGraph, Photo, TrackEdges, choose_good, differentiate
+from hm_sfm.matching.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
 from hm_sfm.matching.matcher import (
     HomoMatcher,
     autocast,
@@ -38,8 +36,10 @@ from hm_sfm.matching.matcher import (
 )
 from hm_sfm.matching.order import order_pairs
 from hm_sfm.matching.store import MatchStore
+from hm_sfm.network.fine import FineMap, HomographyHead, make_fine_map
+from hm_sfm.network.homography import is_regular
+from hm_sfm.photos.images import PreparedImage, prepare_image
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
-from hm_sfm.matching.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
 
 STRIP_PX = 1024
 """Large photos are encoded in strips of so many rows, to bound the memory,"""
@@ -119,7 +119,9 @@ def refine_keypoints(
     store = open_refinement_store(store_path, map(place, members), made_by, digests)
     refine_pairs(tuple(members), place, images, matcher, store, refine_long_edge_px, quiet)
 
-    native = tuple(refine_px_scale(photo, image, refine_long_edge_px) for photo, image in zip(graph.photos, images, strict=True))
+    native = tuple(
+        refine_px_scale(photo, image, refine_long_edge_px) for photo, image in zip(graph.photos, images, strict=True)
+    )
     sharpened = list(graph.links)
     for pair, numbers in members.items():
         placement, found, first, updated = place(pair), store.read(pair), 0, []
@@ -229,7 +231,9 @@ def size_at(image: ImageRef, refine_long_edge_px: int) -> tuple[float, float]:
 
 
 @torch.inference_mode()
-def encode_for_refinement(matcher: HomoMatcher, image: PreparedImage, hypothesis: Hypothesis = IDENTITY) -> RefinementFeatures:
+def encode_for_refinement(
+    matcher: HomoMatcher, image: PreparedImage, hypothesis: Hypothesis = IDENTITY
+) -> RefinementFeatures:
     """The fine features of a photo, strip by strip: what the backbone makes of the whole, but for the last digits."""
     image = apply_hypothesis(image, hypothesis)
     backbone = matcher.net.backbone
@@ -247,7 +251,11 @@ def encode_for_refinement(matcher: HomoMatcher, image: PreparedImage, hypothesis
 
 @torch.inference_mode()
 def refine_pair(
-    matcher: HomoMatcher, features0: RefinementFeatures, features1: RefinementFeatures, pair: ImagePair, placement: Placement
+    matcher: HomoMatcher,
+    features0: RefinementFeatures,
+    features1: RefinementFeatures,
+    pair: ImagePair,
+    placement: Placement,
 ) -> PairMatches:
     """The second pass over a pair: in the order of `placement`; the score is 0 where a patch is of no use.
 

@@ -24,12 +24,12 @@ import pycolmap
 import torch
 import torch.nn.functional as F
 
-from hm_sfm.photos.bitmaps import read_bitmap
 from hm_sfm.colmap.models import quiet_colmap
 from hm_sfm.config import MatchingConfig
-from hm_sfm.geometry.frames import px_from_pixel_index
 from hm_sfm.errors import ConfigError, InputError, MissingPackageError
 from hm_sfm.formats.hloc import check_names, find_group, open_h5, read_features, read_pair
+from hm_sfm.geometry.frames import px_from_pixel_index
+from hm_sfm.photos.bitmaps import read_bitmap
 from hm_sfm.photos.images import CV_ROTATIONS, PreparedImage
 from hm_sfm.types import ImagePair, ImageRef, freeze_array
 

@@ -63,7 +63,10 @@ SCALES = tuple(
     way
     for downscale in DOWNSCALES
     for rotation_deg in ROTATIONS_DEG
-    for way in ((IDENTITY, Hypothesis(rotation_deg, downscale)), (Hypothesis(downscale=downscale), Hypothesis(rotation_deg)))
+    for way in (
+        (IDENTITY, Hypothesis(rotation_deg, downscale)),
+        (Hypothesis(downscale=downscale), Hypothesis(rotation_deg)),
+    )
 )
 """and after them."""
 
@@ -129,7 +132,9 @@ def choose_hypotheses(matcher: "HomoMatcher", sketch0: Sketch, sketch1: Sketch) 
     return None if chosen == UNCHANGED else chosen
 
 
-def relate_scales(way: tuple[Hypothesis, Hypothesis], downscale0: float, downscale1: float) -> tuple[Hypothesis, Hypothesis]:
+def relate_scales(
+    way: tuple[Hypothesis, Hypothesis], downscale0: float, downscale1: float
+) -> tuple[Hypothesis, Hypothesis]:
     """Variants of two photos that have the turns and the relative scale of these hypotheses of their sketches.
 
     downscale0, downscale1: of the sketches against the photos, which may be of different sizes.
@@ -137,7 +142,8 @@ def relate_scales(way: tuple[Hypothesis, Hypothesis], downscale0: float, downsca
     reductions = way[0].downscale * downscale0, way[1].downscale * downscale1
     factors = [downscale / min(reductions) for downscale in reductions]
     hypothesis0, hypothesis1 = (
-        Hypothesis(hypothesis.rotation_deg, factor if factor >= MIN_DOWNSCALE else 1) for hypothesis, factor in zip(way, factors)
+        Hypothesis(hypothesis.rotation_deg, factor if factor >= MIN_DOWNSCALE else 1)
+        for hypothesis, factor in zip(way, factors)
     )
     return hypothesis0, hypothesis1
 

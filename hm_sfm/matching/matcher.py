@@ -13,20 +13,20 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, parse_config
+from hm_sfm.errors import ConfigError, WeightsError
+from hm_sfm.geometry.frames import Grid
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.matching.coarse_matches import PointPairs, make_provider
-from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, parse_config
-from hm_sfm.geometry.frames import Grid
-from hm_sfm.errors import ConfigError, WeightsError
-from hm_sfm.photos.images import PreparedImage, prepare_array, prepare_image, read_ref
+from hm_sfm.matching.hypotheses import Sketch, apply_hypothesis, retry_hypotheses
 from hm_sfm.network.backbone import LightBackbone
 from hm_sfm.network.coarse import AspanCoarse, AttentionCoarse, CosineCoarse, LoftrCoarse
 from hm_sfm.network.fine import ExpectationHead, FineMap, HomographyHead, make_fine_map
 from hm_sfm.network.growth import GridMatches, PatchGrid, grow_matches
 from hm_sfm.network.homography import is_regular, make_corners
 from hm_sfm.network.resnet import LoftrBackbone
+from hm_sfm.photos.images import PreparedImage, prepare_array, prepare_image, read_ref
 from hm_sfm.types import ImageRef, PatchMatches
-from hm_sfm.matching.hypotheses import Sketch, retry_hypotheses, apply_hypothesis
 
 WEIGHTS_FOLDER = Path(__file__).parents[1] / "network" / "weights"
 FINE_CHUNK = 512

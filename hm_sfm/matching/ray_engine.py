@@ -16,11 +16,11 @@ from typing import Any
 
 from tqdm import tqdm
 
-from hm_sfm.io.batches import store_in_batches
 from hm_sfm.errors import HmSfmError, WorkerLostError
-from hm_sfm.matching.run import FeatureCache, MatchingTimes
+from hm_sfm.io.batches import store_in_batches
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.order import order_pairs
+from hm_sfm.matching.run import FeatureCache, MatchingTimes
 from hm_sfm.matching.shards import CACHED_IMAGES
 from hm_sfm.matching.store import MatchStore
 from hm_sfm.types import ImagePair, ImageRef, PairMatches

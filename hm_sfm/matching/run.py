@@ -9,14 +9,14 @@ from importlib.util import find_spec
 
 from tqdm import tqdm
 
-from hm_sfm.io.batches import store_in_batches
 from hm_sfm.errors import ConfigError, MissingPackageError
-from hm_sfm.photos.images import PreparedImage, prepare_image
+from hm_sfm.io.batches import store_in_batches
+from hm_sfm.matching.hypotheses import IDENTITY, Hypothesis, Sketch, apply_hypothesis, retry_hypotheses
 from hm_sfm.matching.matcher import HomoMatcher, ImageFeatures
 from hm_sfm.matching.order import order_pairs
 from hm_sfm.matching.store import MatchStore
+from hm_sfm.photos.images import PreparedImage, prepare_image
 from hm_sfm.types import ImagePair, ImageRef, PairMatches, PatchMatches
-from hm_sfm.matching.hypotheses import IDENTITY, Sketch, Hypothesis, retry_hypotheses, apply_hypothesis
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from hm_sfm.io.atomic import replace_file
 from hm_sfm.errors import InputError, StaleResultError
+from hm_sfm.io.atomic import replace_file
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
 VERSION = 1

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from hm_sfm.matching.coarse_matches import PointPairs
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig
-from hm_sfm.photos.images import PreparedImage
+from hm_sfm.matching.coarse_matches import PointPairs
 from hm_sfm.matching.matcher import HomoMatcher, ImageFeatures, load_weights, read_checkpoint
+from hm_sfm.photos.images import PreparedImage
 
 LOFTR = NetworkConfig(backbone="loftr", head="expectation", coarse="attention", iterations=1, margin=0)
 """What a public LoFTR checkpoint holds; its fine stage is left alone."""

@@ -90,7 +90,8 @@ class FlowStart(nn.Module):
 
     def forward(self, cells: tuple[Tensor, Tensor], places: tuple[Tensor, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """cells: (B, C, H, W) of both images, places: (B, P, H, W) of both. Returns their cells, and their features of
-        the flow, (B, P, H, W) each."""
+        the flow, (B, P, H, W) each.
+        """
         first, second = (shrink(x, GLOBAL_POOL) for x in cells)
         place0, place1 = (shrink(x, GLOBAL_POOL) for x in places)
         for layer in self.layers:
@@ -149,7 +150,8 @@ class GlobalLocalBlock(nn.Module):
         self, cells: Tensor, features: Tensor, source: Tensor, source_places: Tensor
     ) -> tuple[Tensor, Tensor, Flow]:
         """cells: (B, C, H0, W0), features: (B, P, H0, W0) of their flow; source: (B, C, H1, W1), source_places:
-        (B, P, H1, W1). Returns cells, features and the flow that was read from the given features."""
+        (B, P, H1, W1). Returns cells, features and the flow that was read from the given features.
+        """
         flow = self.read_flow(features, source.shape[2:])
         query, key = self.query(cells), self.key(source)
         value = self.value(torch.cat([source, source_places], dim=1))
@@ -181,7 +183,8 @@ class SpanTransformer(nn.Module):
 
     def attend(self, map0: Tensor, map1: Tensor) -> tuple[Tensor, Tensor, list[tuple[Flow, Flow]]]:
         """Maps (B, C, H0, W0), (B, C, H1, W1) float32, with positions added -> both, each aware of the other, and the
-        flow of each block, from image 0 to image 1 and back."""
+        flow of each block, from image 0 to image 1 and back.
+        """
         cells = map0, map1
         places = tuple(
             self.place(place_positions(self.channels, *x.shape[2:], x.device)[None]).expand(len(x), -1, -1, -1)
@@ -198,7 +201,8 @@ class SpanTransformer(nn.Module):
 
 def attend_globally(query: Tensor, key: Tensor, value: Tensor, heads: int, pool: int) -> Tensor:
     """What every token of a reduced map gathers from all of another: queries (B, C, H0, W0), keys and values
-    (B, C, H1, W1) -> (B, C, H0, W0); pool: side of the squares of cells that are a token."""
+    (B, C, H1, W1) -> (B, C, H0, W0); pool: side of the squares of cells that are a token.
+    """
     reduced = shrink(query, pool)
     tokens = (_split_heads(shrink(x, pool).flatten(2).transpose(1, 2), heads) for x in (query, key, value))
     message = F.scaled_dot_product_attention(*tokens)
@@ -276,7 +280,8 @@ def find_cells(positions: Tensor, size_hw: tuple[int, int]) -> tuple[Tensor, Ten
 
 def shrink(x: Tensor, pool: int) -> Tensor:
     """Means over squares of `pool` x `pool` cells, (B, C, H, W) -> (B, C, ceil(H / pool), ceil(W / pool)); those at the
-    lower and right edges may be cut off."""
+    lower and right edges may be cut off.
+    """
     return x if pool == 1 else F.avg_pool2d(x, pool, ceil_mode=True)
 
 

@@ -11,8 +11,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from hm_sfm.geometry.frames import Grid
 from hm_sfm.errors import WeightsError
+from hm_sfm.geometry.frames import Grid
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,8 @@ class AspanCoarse(SpanTransformer):
 
     def estimate(self, coarse0: Tensor, coarse1: Tensor) -> tuple[Tensor, Tensor, list[tuple[Flow, Flow]]]:
         """Described cells (B, N0, C + 2), (B, N1, C + 2) -> features (B, N0, C), (B, N1, C), each aware of the other
-        image, and the flow of each block in both directions."""
+        image, and the flow of each block in both directions.
+        """
         map0, map1, flows = self.attend(*(as_map(cells) for cells in (coarse0, coarse1)))
         return map0.flatten(2).transpose(1, 2), map1.flatten(2).transpose(1, 2), flows
 
@@ -139,7 +140,8 @@ class AspanCoarse(SpanTransformer):
 
     def match(self, coarse0: Tensor, coarse1: Tensor, threshold: float) -> Matches:
         """Match described cells (N0, C + 2) and (N1, C + 2), each all of its image: confidence of at least
-        `threshold`."""
+        `threshold`.
+        """
         aware0, aware1 = self(coarse0[None], coarse1[None])
         return match_by_dual_softmax(aware0[0].float(), aware1[0].float(), threshold, self.sharpness)
 

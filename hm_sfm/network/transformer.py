@@ -91,7 +91,8 @@ class CoarseTransformer(nn.Module):
 
     def forward(self, coarse0: Tensor, coarse1: Tensor, first_layer: int = 0) -> tuple[Tensor, Tensor]:
         """coarse0: (B, N0, C), coarse1: (B, N1, C), after the layers before `first_layer`. Returns both, each aware of
-        the other."""
+        the other.
+        """
         for number, layer in enumerate(self.layers[first_layer:], start=first_layer):
             if number % 2:
                 coarse0 = layer(coarse0, coarse1)

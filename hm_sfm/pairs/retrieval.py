@@ -15,13 +15,13 @@ import h5py
 import numpy as np
 from tqdm import tqdm
 
+from hm_sfm.config import fingerprint
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.io.batches import store_in_batches
-from hm_sfm.config import fingerprint
-from hm_sfm.photos.images import prepare_image
-from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.types import ImageRef
 from hm_sfm.matching.hypotheses import ROTATIONS_DEG, Hypothesis, apply_hypothesis
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.photos.images import prepare_image
+from hm_sfm.types import ImageRef
 
 logger = logging.getLogger(__name__)
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from hm_sfm.io.atomic import replace_file
 from hm_sfm.colmap.models import quiet_colmap
 from hm_sfm.config import PairConfig
 from hm_sfm.errors import ConfigError, InputError
+from hm_sfm.io.atomic import replace_file
 from hm_sfm.types import ImagePair
 
 logger = logging.getLogger(__name__)

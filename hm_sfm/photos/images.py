@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import pycolmap
 
-from hm_sfm.photos.bitmaps import HEIC_EXTENSIONS, INSTALL_HEIC, can_read_heic, read_bitmap
-from hm_sfm.geometry.frames import rotation_matrix
 from hm_sfm.errors import ConfigError, InputError
+from hm_sfm.geometry.frames import rotation_matrix
+from hm_sfm.photos.bitmaps import HEIC_EXTENSIONS, INSTALL_HEIC, can_read_heic, read_bitmap
 from hm_sfm.types import ImageRef, freeze_array
 
 logger = logging.getLogger(__name__)

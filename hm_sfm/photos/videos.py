@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from hm_sfm.io.atomic import make_folder
 from hm_sfm.config import fingerprint
 from hm_sfm.errors import ConfigError, InputError
+from hm_sfm.io.atomic import make_folder
 from hm_sfm.photos.images import EXTENSIONS
 
 logger = logging.getLogger(__name__)
@@ -147,7 +147,8 @@ def count_frames(path: Path, quiet: bool) -> Iterator[tuple[int, np.ndarray]]:
 
 def read_frames(path: Path) -> Iterator[tuple[int, np.ndarray]]:
     """Every frame of a video that can be decoded, in order: milliseconds from the start, which never fall, and the
-    (H, W, 3) uint8 BGR pixels, turned upright as the video says."""
+    (H, W, 3) uint8 BGR pixels, turned upright as the video says.
+    """
     milliseconds = 0
     with open_video(path) as video:
         while True:

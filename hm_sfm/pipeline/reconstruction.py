@@ -17,30 +17,37 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from hm_sfm.io.atomic import replace_file
-from hm_sfm.matching.coarse_matches import check_coarse, describe_coarse
-from hm_sfm.config import Config, fingerprint
 from hm_sfm.colmap.database import Cameras, make_cameras, write_database
-from hm_sfm.report.diagnosis import Diagnosis, diagnose
+from hm_sfm.colmap.mapping import choose_mapper, map_images, summarise_models
+from hm_sfm.colmap.rigs import expand_pairs, read_rigs
+from hm_sfm.colmap.verification import VerifiedPair, verify_database, verify_pairs
+from hm_sfm.config import Config, fingerprint
 from hm_sfm.errors import InputError, NoModelError
 from hm_sfm.formats.hloc import write_features, write_matches
-from hm_sfm.photos.images import list_images, prepare_image
-from hm_sfm.keypoints.propagation import KeypointGraph, Photo, find_seeds, finish_keypoints, propagate_keypoints, prune_edges
+from hm_sfm.io.atomic import replace_file
 from hm_sfm.io.locks import lock_file, release_locks, wait_in_line
-from hm_sfm.colmap.mapping import choose_mapper, map_images, summarise_models
-from hm_sfm.photos.masks import NO_MASKS, MaskedStore, Masks, read_masks
-from hm_sfm.matching.run import check_engine, match_pairs
+from hm_sfm.keypoints.propagation import (
+    KeypointGraph,
+    Photo,
+    find_seeds,
+    finish_keypoints,
+    propagate_keypoints,
+    prune_edges,
+)
+from hm_sfm.keypoints.refinement import refine_keypoints
+from hm_sfm.matching.coarse_matches import check_coarse, describe_coarse
 from hm_sfm.matching.matcher import HomoMatcher, digest_weights
+from hm_sfm.matching.run import check_engine, match_pairs
+from hm_sfm.matching.shards import Shard, merge_shards, refuse_shards
+from hm_sfm.matching.store import MatchStore, digest_image
+from hm_sfm.pairs.retrieval import CellStore, describe_images, find_similar
 from hm_sfm.pairs.selection import read_pairs, select_pairs, write_pairs
+from hm_sfm.photos.images import list_images, prepare_image
+from hm_sfm.photos.masks import NO_MASKS, MaskedStore, Masks, read_masks
+from hm_sfm.report.diagnosis import Diagnosis, diagnose
 from hm_sfm.report.gather import gather_report
 from hm_sfm.report.page import write_report
-from hm_sfm.pairs.retrieval import CellStore, describe_images, find_similar
-from hm_sfm.colmap.rigs import expand_pairs, read_rigs
-from hm_sfm.matching.shards import Shard, merge_shards, refuse_shards
-from hm_sfm.keypoints.refinement import refine_keypoints
-from hm_sfm.matching.store import MatchStore, digest_image
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, MappingResult
-from hm_sfm.colmap.verification import VerifiedPair, verify_database, verify_pairs
 
 logger = logging.getLogger(__name__)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from hm_sfm.config import Config
 from hm_sfm.colmap.database import Cameras, open_database, read_verified_matches
+from hm_sfm.config import Config
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
 MOST_LISTED = 4

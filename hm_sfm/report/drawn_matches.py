@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from hm_sfm.evaluation.relative_poses import PosePair
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.photos.images import PreparedImage, prepare_image, read_ref
-from hm_sfm.evaluation.relative_poses import PosePair
 from hm_sfm.types import PatchMatches, apply_homographies
 
 LONG_EDGE_PX = 1024

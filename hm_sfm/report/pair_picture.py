@@ -6,15 +6,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hm_sfm.io.atomic import replace_file
-from hm_sfm.config import CameraConfig, VerificationConfig
 from hm_sfm.colmap.database import make_cameras
+from hm_sfm.colmap.verification import is_convincing, verify_pair
+from hm_sfm.config import CameraConfig, VerificationConfig
 from hm_sfm.errors import InputError
+from hm_sfm.io.atomic import replace_file
+from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.photos.images import PreparedImage, prepare_image, read_ref
 from hm_sfm.report.drawn_matches import GAP_PX, WORST_PX, draw_photo_matches, make_grey, place_points
-from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.types import PatchMatches, apply_homographies
-from hm_sfm.colmap.verification import is_convincing, verify_pair
 
 LONG_EDGE_PX = 800
 """Of each photo in the picture."""
@@ -87,7 +87,8 @@ def draw_pair(matcher: HomoMatcher, path_a: Path, path_b: Path, checks: Verifica
 
 def warp_photo(photo_a: PreparedImage, photo_b: PreparedImage, matches: PatchMatches) -> tuple[np.ndarray, np.ndarray]:
     """Photo B as it looks from A: (H, W) uint8 of A's size, black where no match covers a pixel, and which ones are
-    covered, (H, W) bool."""
+    covered, (H, W) bool.
+    """
     height, width = photo_a.grey.shape
     row, column = np.indices((height, width))
     pixels = np.stack([column.ravel(), row.ravel()], axis=1) + 0.5

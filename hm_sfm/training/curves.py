@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hm_sfm.io.atomic import replace_file
 from hm_sfm.errors import MissingPackageError
+from hm_sfm.io.atomic import replace_file
 
 SMOOTHED_SHARE = 0.02
 """Of the steps that each point of a loss curve is the mean of."""

@@ -31,7 +31,8 @@ LARGEST_ERROR = 8.0
 
 def measure_errors(estimate: FineEstimate, truth: PatchSupervision, dense: bool = True) -> Tensor:
     """(P, 81) float32 cells: distance of the predicted from the true dense points of each patch; dense False: (P, 1),
-    that of its centre alone."""
+    that of its centre alone.
+    """
     points = make_patch_grid(DENSE_RADIUS if dense else 0.0, DENSE_STEP, truth.homography.device)
     predicted = apply_homography(estimate.homography, points)
     return (predicted - apply_homography(truth.homography, points)).norm(dim=-1)
@@ -67,7 +68,8 @@ def measure_loss(
 
 def measure_point_loss(estimates: list[FineEstimate], truth: PointSupervision, half: float) -> Tensor:
     """The loss of patches of which one pair of points is known, a scalar: its error beyond TEACHER_ERROR, where the
-    estimate is regular, and the error scale; weighted as in measure_loss."""
+    estimate is regular, and the error scale; weighted as in measure_loss.
+    """
     count = truth.correct.sum().clamp_min(1)
     total = truth.point0.new_zeros(())
     for age, estimate in enumerate(reversed(estimates)):

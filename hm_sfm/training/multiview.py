@@ -15,9 +15,9 @@ import numpy as np
 import pycolmap
 from torch.utils.data import Dataset
 
-from hm_sfm.io.atomic import replace_file
-from hm_sfm.geometry.frames import homography_to_pixel_index
 from hm_sfm.errors import InputError
+from hm_sfm.geometry.frames import homography_to_pixel_index
+from hm_sfm.io.atomic import replace_file
 from hm_sfm.training.photos import POINTS, SURFACES, disturb_view, render_view
 
 LARGEST_ERROR_PX = 1.5
@@ -166,7 +166,8 @@ class PhotoPairs(Dataset):
         self, shape_hw: tuple[int, int], anchor: np.ndarray, scale: float, rotation_deg: float, rng: np.random.Generator
     ) -> np.ndarray:
         """(3, 3) px of the photo -> px of the view. The view shows the photo's point `anchor`, and no more of what is
-        beyond the photo's borders than it must (but for the turn)."""
+        beyond the photo's borders than it must (but for the turn).
+        """
         cosine, sine = scale * np.cos(np.radians(rotation_deg)), scale * np.sin(np.radians(rotation_deg))
         matrix = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
         view, photo = np.array(self.size_wh), scale * np.array(shape_hw[::-1])

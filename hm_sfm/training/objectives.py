@@ -7,11 +7,11 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 from torch import Tensor
 
+from hm_sfm.matching.matcher import HomoNet
 from hm_sfm.network.aspan import Flow
 from hm_sfm.network.backbone import FeatureMaps
 from hm_sfm.network.coarse import AspanCoarse
 from hm_sfm.network.fine import FineEstimate, make_fine_map
-from hm_sfm.matching.matcher import HomoNet
 from hm_sfm.training.losses import (
     FLOW_WEIGHT,
     measure_coarse_loss,
@@ -45,7 +45,8 @@ def run_backbone(net: HomoNet, images: Tensor, want_fine: bool) -> FeatureMaps:
 
 def run_coarse(net: HomoNet, maps: FeatureMaps) -> tuple[Tensor, Tensor, list[tuple[Flow, Flow]]]:
     """(B, N, C) float32 of both views: cells as the coarse stage compares them; and the flows, from A to B and back, by
-    which it found them, none where it works without."""
+    which it found them, none where it works without.
+    """
     described = net.coarse.describe(maps.coarse).flatten(2).transpose(1, 2).unflatten(0, (-1, 2))
     flows = []
     if isinstance(net.coarse, AspanCoarse):
@@ -73,7 +74,8 @@ def measure_objective(
     supervise: str = "suppressed",
 ) -> dict[str, Tensor]:
     """Scalars `loss` and its parts for a batch of training pairs; stage: coarse | fine | joint; supervise: what of the
-    fine stage, as in TrainConfig."""
+    fine stage, as in TrainConfig.
+    """
     jittered_share = JITTERED_SHARE if supervise == "suppressed" else 0.0
     with autocast(precision, device):
         maps = run_backbone(net, batch["images"].to(device), stage != "coarse")

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from torch.utils.data import Dataset
 
-from hm_sfm.geometry.frames import homography_to_pixel_index
 from hm_sfm.errors import InputError
+from hm_sfm.geometry.frames import homography_to_pixel_index
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 LONG_EDGE_PX = 640
@@ -70,7 +70,8 @@ def split_photos(photos: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.nd
 class WarpedPhotos(Dataset):
     """Items, of views of size_wh = (W, H) px: images (2, H, W) uint8, b_from_a (SURFACES, 3, 3) float32 (px of view
     A -> px of view B, by surface), surface (H, W) int64 (the surface at each pixel of A, -1 where B does not show it)
-    and points (POINTS, 4) float32, all NaN: x0, y0, x1, y1 px of single points for kinds of pairs without surfaces."""
+    and points (POINTS, 4) float32, all NaN: x0, y0, x1, y1 px of single points for kinds of pairs without surfaces.
+    """
 
     def __init__(
         self, photos: list[np.ndarray], size_wh: tuple[int, int], seed: int, count: int, warp: WarpRange

@@ -66,7 +66,8 @@ class Texture:
 
     def reduce(self, steps_u: int, steps_v: int) -> tuple[np.ndarray, np.ndarray]:
         """The texture with its columns reduced by 2^(steps_u / 2), its rows by 2^(steps_v / 2), (H', W') uint8, and
-        the (3, 3) transform from px of the photo to px of that."""
+        the (3, 3) transform from px of the photo to px of that.
+        """
         height, width = self.photo.shape
         size_wh = max(1, round(width * 2 ** (-steps_u / 2))), max(1, round(height * 2 ** (-steps_v / 2)))
         key = steps_u, steps_v
@@ -350,7 +351,7 @@ def find_nearest(facets: Sequence[Facet], view: PinholeView) -> DepthMap:
 
 
 def pixel_centres(size_wh: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """x (1, W) and y (H, 1) float32 px of the pixels' centres."""
+    """X (1, W) and y (H, 1) float32 px of the pixels' centres."""
     return np.arange(size_wh[0], dtype=np.float32)[None] + 0.5, np.arange(size_wh[1], dtype=np.float32)[:, None] + 0.5
 
 

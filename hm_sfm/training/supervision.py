@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from hm_sfm.geometry.frames import Grid
-from hm_sfm.network.homography import apply_homography, is_regular, make_corners
 from hm_sfm.matching.matcher import fine_cell_of
+from hm_sfm.network.homography import apply_homography, is_regular, make_corners
 
 JITTERED_SHARE = 0.25
 """Of the patches whose coarse match is one cell off: what mutual nearest neighbours suppress or get wrong."""

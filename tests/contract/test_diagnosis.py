@@ -7,13 +7,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hm_sfm.config import Config, ImageConfig
 from hm_sfm.colmap.database import Cameras, write_database
-from hm_sfm.report.diagnosis import MOST_LISTED, Cause, Diagnosis, diagnose
+from hm_sfm.colmap.verification import verify_database
+from hm_sfm.config import Config, ImageConfig
 from hm_sfm.errors import InputError
 from hm_sfm.pairs.selection import pair_exhaustively
+from hm_sfm.report.diagnosis import MOST_LISTED, Cause, Diagnosis, diagnose
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, PairMatches
-from hm_sfm.colmap.verification import verify_database
 
 
 class Run:

@@ -12,14 +12,14 @@ import pycolmap
 import pytest
 
 import hm_sfm.colmap.mapping
-from hm_sfm.config import MappingConfig, VerificationConfig
 from hm_sfm.colmap.database import Cameras, open_database, write_database
-from hm_sfm.errors import ConfigError, InputError
-from hm_sfm.formats.hloc import read_features, read_matches, write_features, write_matches
 from hm_sfm.colmap.mapping import choose_mapper, map_globally, map_images, map_incrementally, summarise_models
 from hm_sfm.colmap.snapshots import digest_inputs
-from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, PairMatches
 from hm_sfm.colmap.verification import is_convincing, verify_database, verify_pair, verify_pairs
+from hm_sfm.config import MappingConfig, VerificationConfig
+from hm_sfm.errors import ConfigError, InputError
+from hm_sfm.formats.hloc import read_features, read_matches, write_features, write_matches
+from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, PairMatches
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 
 from hm_sfm.config import Config, fingerprint
+from hm_sfm.keypoints.tracks import build_tracks, count_neighbours
 from hm_sfm.report.diagnosis import Cause, Diagnosis
 from hm_sfm.report.gather import (
     MOST_WEAK_PAIRS,
@@ -18,7 +19,6 @@ from hm_sfm.report.gather import (
     make_upright,
     read_baselines,
 )
-from hm_sfm.keypoints.tracks import build_tracks, count_neighbours
 from hm_sfm.types import ImageRef
 
 

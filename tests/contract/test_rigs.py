@@ -10,15 +10,15 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hm_sfm.config import CameraConfig, Config, MappingConfig, PairConfig
 from hm_sfm.colmap.database import Cameras, make_cameras, open_database, write_database
+from hm_sfm.colmap.mapping import map_images
+from hm_sfm.colmap.rigs import lack_poses, read_rigs
+from hm_sfm.colmap.verification import verify_database
+from hm_sfm.config import CameraConfig, Config, MappingConfig, PairConfig
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.photos.exif import write_jpeg
-from hm_sfm.colmap.mapping import map_images
 from hm_sfm.pipeline.reconstruction import choose_pairs
-from hm_sfm.colmap.rigs import lack_poses, read_rigs
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
-from hm_sfm.colmap.verification import verify_database
 
 RIG = [
     {

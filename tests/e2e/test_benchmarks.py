@@ -14,11 +14,11 @@ import pytest
 import torch
 from PIL import Image
 
-from hm_sfm.matching.coarse_matches import read_rgb, to_px
 from hm_sfm.config import Config, VerificationConfig
 from hm_sfm.errors import InputError
-from hm_sfm.photos.images import read_ref
 from hm_sfm.evaluation.relative_poses import PointMatches
+from hm_sfm.matching.coarse_matches import read_rgb, to_px
+from hm_sfm.photos.images import read_ref
 from hm_sfm.types import ImagePair
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
@@ -192,7 +192,7 @@ class FakeAliked(torch.nn.Module):
 
     def extract(self, pixels, resize):
         FakeAliked.encoded += 1
-        assert resize is None and pixels.shape[0] == 3 and 0 <= pixels.min() and 0.5 < pixels.max() <= 1
+        assert resize is None and pixels.shape[0] == 3 and pixels.min() >= 0 and 0.5 < pixels.max() <= 1
         return {"keypoints": torch.arange(4.0)[None, :, None].repeat(1, 1, 2) * 10}
 
 

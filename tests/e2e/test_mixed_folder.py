@@ -10,9 +10,9 @@ import pycolmap
 import pytest
 
 from hm_sfm.colmap.database import open_database, read_verified_matches
-from hm_sfm.synthetic.demo import COLMAP_DIAGONAL_35MM, make_demo_scene, make_demo_views
 from hm_sfm.evaluation.poses import score_model
 from hm_sfm.photos.exif import write_jpeg
+from hm_sfm.synthetic.demo import COLMAP_DIAGONAL_35MM, make_demo_scene, make_demo_views
 from hm_sfm.synthetic.rendering import render_view
 from hm_sfm.types import PinholeView
 

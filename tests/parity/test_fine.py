@@ -8,8 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig
-from hm_sfm.photos.images import prepare_array
-from hm_sfm.network import model
+from hm_sfm.matching import matcher as model
 from hm_sfm.network.coarse import match_by_similarity
 from hm_sfm.network.fine import (
     ExpectationHead,
@@ -21,6 +20,7 @@ from hm_sfm.network.fine import (
     make_pooling,
     sample_windows,
 )
+from hm_sfm.photos.images import prepare_array
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ from kornia.feature import LoFTR
 
 from hm_sfm.config import ImageConfig, MatchingConfig
 from hm_sfm.errors import MissingPackageError, WeightsError
-from hm_sfm.photos.images import prepare_array
 from hm_sfm.evaluation.loftr import LoftrMatcher
+from hm_sfm.photos.images import prepare_array
 
 
 @pytest.fixture(scope="module")

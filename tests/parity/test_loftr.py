@@ -8,8 +8,8 @@ from kornia.feature import LoFTR
 
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, load_config
 from hm_sfm.errors import WeightsError
-from hm_sfm.network.coarse import SHARPNESS, make_log_confidences, match_by_dual_softmax, sum_exponentials
 from hm_sfm.matching.matcher import HomoMatcher, HomoNet, load_weights
+from hm_sfm.network.coarse import SHARPNESS, make_log_confidences, match_by_dual_softmax, sum_exponentials
 from hm_sfm.network.transformer import attend_linearly
 
 LOFTR = NetworkConfig(backbone="loftr", coarse="attention", head="expectation", margin=0)

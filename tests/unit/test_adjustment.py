@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hm_sfm.keypoints.adjustment import Anchors, adjust_keypoints, measure_residuals, predict_targets
 from hm_sfm.config import KeypointConfig
+from hm_sfm.keypoints.adjustment import Anchors, adjust_keypoints, measure_residuals, predict_targets
 
 ROUNDS = KeypointConfig().adjustment_rounds
 

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, load_config
 from hm_sfm.errors import ConfigError, WeightsError
+from hm_sfm.matching.matcher import HomoMatcher, HomoNet, load_weights
 from hm_sfm.network import aspan
 from hm_sfm.network.aspan import (
     GLOBAL_POOL,
@@ -29,7 +30,6 @@ from hm_sfm.network.aspan import (
     shrink,
 )
 from hm_sfm.network.coarse import AspanCoarse
-from hm_sfm.matching.matcher import HomoMatcher, HomoNet, load_weights
 from hm_sfm.training import loop
 from hm_sfm.training.loop import TrainConfig, train
 from hm_sfm.training.losses import FLOW_WEIGHT, measure_coarse_loss, measure_flow_loss

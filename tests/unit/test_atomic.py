@@ -1,7 +1,7 @@
 import pytest
 
-from hm_sfm.io.atomic import make_folder, replace_file
 from hm_sfm.errors import InputError
+from hm_sfm.io.atomic import make_folder, replace_file
 
 
 def test_a_file_appears_when_the_block_ends(tmp_path):

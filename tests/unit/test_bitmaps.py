@@ -9,10 +9,10 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from hm_sfm.photos.bitmaps import open_to_colmap, read_bitmap
-from hm_sfm.config import CameraConfig
 from hm_sfm.colmap.database import make_cameras
+from hm_sfm.config import CameraConfig
 from hm_sfm.errors import InputError, MissingPackageError
+from hm_sfm.photos.bitmaps import open_to_colmap, read_bitmap
 from hm_sfm.photos.images import list_images, prepare_image, read_ref
 
 

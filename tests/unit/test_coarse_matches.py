@@ -12,7 +12,11 @@ import pytest
 import torch
 
 from hm_sfm import HomoMatcher
-from hm_sfm.matching import coarse_matches
+from hm_sfm.config import Config, ImageConfig, MatchingConfig
+from hm_sfm.errors import ConfigError, InputError, MissingPackageError, WeightsError
+from hm_sfm.formats.hloc import write_features, write_matches
+from hm_sfm.geometry.frames import Grid, homography_to_pixel_index
+from hm_sfm.matching import coarse_matches, weights_coarse
 from hm_sfm.matching.coarse_matches import (
     LightGlueCoarse,
     MatchFile,
@@ -23,14 +27,9 @@ from hm_sfm.matching.coarse_matches import (
     make_provider,
     match_by_ratio,
 )
-from hm_sfm.config import Config, ImageConfig, MatchingConfig
-from hm_sfm.geometry.frames import Grid, homography_to_pixel_index
-from hm_sfm.errors import ConfigError, InputError, MissingPackageError, WeightsError
-from hm_sfm.formats.hloc import write_features, write_matches
-from hm_sfm.photos.images import prepare_array
-from hm_sfm.network import weights_coarse
-from hm_sfm.network.homography import apply_homography, homography_from_corners
 from hm_sfm.matching.matcher import HomoNet, load_weights, make_start, round_to_cells, save_weights
+from hm_sfm.network.homography import apply_homography, homography_from_corners
+from hm_sfm.photos.images import prepare_array
 from hm_sfm.pipeline.reconstruction import describe_matching
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
@@ -266,7 +265,9 @@ def write_loftr(path: Path) -> Path:
     net = HomoNet(weights_coarse.LOFTR)
     names = {"backbone": "backbone", "coarse": "loftr_coarse"}
     state = {key.partition("."): value for key, value in net.state_dict().items()}
-    torch.save({f"matcher.{names[part]}.{rest}": value for (part, _, rest), value in state.items() if part in names}, path)
+    torch.save(
+        {f"matcher.{names[part]}.{rest}": value for (part, _, rest), value in state.items() if part in names}, path
+    )
     return path
 
 

@@ -8,6 +8,8 @@ import numpy as np
 import pycolmap
 import pytest
 
+from hm_sfm.colmap.database import Cameras
+from hm_sfm.config import Config, MappingConfig
 from hm_sfm.evaluation.comparison import (
     Method,
     Run,
@@ -19,8 +21,6 @@ from hm_sfm.evaluation.comparison import (
     read_seconds,
     read_tracks,
 )
-from hm_sfm.config import Config, MappingConfig
-from hm_sfm.colmap.database import Cameras
 from hm_sfm.types import ImagePair, ImageRef
 
 SECONDS = {"match": 1.239, "keypoints": None, "verify": 0.5, "map": 2.0}

@@ -12,8 +12,8 @@ import pytest
 
 from hm_sfm.cli import main
 from hm_sfm.errors import ConfigError, InputError
-from hm_sfm.photos.videos import choose_sharpest, extract_frames, measure_sharpness
 from hm_sfm.photos.images import list_images
+from hm_sfm.photos.videos import choose_sharpest, extract_frames, measure_sharpness
 
 FPS = 10
 SHARP = (3, 14, 20)

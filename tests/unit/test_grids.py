@@ -15,10 +15,10 @@ from torch import nn
 from hm_sfm import HomoMatcher
 from hm_sfm.config import ImageConfig
 from hm_sfm.geometry.frames import Grid
-from hm_sfm.photos.images import prepare_array
+from hm_sfm.matching.matcher import cell_to_px, count_cells, fine_cell_of
 from hm_sfm.network.backbone import FineBranch, LightBackbone, XFeatTrunk
 from hm_sfm.network.coarse import CosineCoarse, match_by_similarity
-from hm_sfm.matching.matcher import cell_to_px, count_cells, fine_cell_of
+from hm_sfm.photos.images import prepare_array
 from hm_sfm.training.supervision import patch_homography
 
 COARSE, FINE = LightBackbone.coarse_grid, LightBackbone.fine_grid

@@ -5,9 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hm_sfm.keypoints.selection import select_keypoints, rank_in_groups
 from hm_sfm.config import KeypointConfig
-from hm_sfm.photos.images import prepare_array
 from hm_sfm.keypoints.propagation import (
     MIN_PROPAGATING,
     Photo,
@@ -17,11 +15,13 @@ from hm_sfm.keypoints.propagation import (
     find_seeds,
     finish_keypoints,
     group_matches,
-    propagate_keypoints,
     persist_keypoints,
+    propagate_keypoints,
     prune_edges,
     thin_points,
 )
+from hm_sfm.keypoints.selection import rank_in_groups, select_keypoints
+from hm_sfm.photos.images import prepare_array
 from hm_sfm.types import ImagePair, PairMatches, apply_homographies
 
 CONFIG = KeypointConfig()
@@ -129,7 +129,7 @@ def test_predictions_that_disagree_a_little_are_averaged():
 
 
 def test_a_keypoint_is_carried_back_through_the_inverse():
-    """b has the keypoint first, from its pair with c; a, which is in more pairs, gets it from b."""
+    """B has the keypoint first, from its pair with c; a, which is in more pairs, gets it from b."""
     linear = np.array([[1.2, -0.2, 4], [0.1, 0.9, -2], [1e-4, -2e-4, 1]])
     names = "abcdefg"
     photos = [make_photo(name, *([(60.0, 50.0)] if name == "b" else [])) for name in names]
@@ -357,7 +357,10 @@ def test_thinned_links_are_those_that_the_budget_keeps(scene):
     thinned = prune_edges(graph, config)
     of_all, of_thinned = (sum(len(links.source) for links in of.links) for of in (graph, thinned))
     assert 0 < of_thinned < 0.6 * of_all
-    (keypoints, matches), (few_keypoints, few_matches) = finish_keypoints(graph, config), finish_keypoints(thinned, config)
+    (keypoints, matches), (few_keypoints, few_matches) = (
+        finish_keypoints(graph, config),
+        finish_keypoints(thinned, config),
+    )
     for found, again in zip(keypoints, few_keypoints, strict=True):
         np.testing.assert_allclose(found.xy, again.xy, atol=0.02)
     for found, again in zip(matches, few_matches, strict=True):

@@ -12,7 +12,7 @@ import torch
 from hm_sfm import HomoMatcher
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, load_config
 from hm_sfm.errors import ConfigError, InputError, WeightsError
-from hm_sfm.network import model
+from hm_sfm.matching import matcher as model
 from hm_sfm.matching.matcher import (
     HomoNet,
     digest_weights,

@@ -2,10 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hm_sfm.geometry.frames import homography_from_pixel_index, homography_to_pixel_index
 from hm_sfm.errors import InputError
 from hm_sfm.evaluation.poses import write_strecha_cameras
-from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.evaluation.relative_poses import (
     PointMatches,
     PosePair,
@@ -17,6 +15,8 @@ from hm_sfm.evaluation.relative_poses import (
     score_homographies,
     score_pose_matches,
 )
+from hm_sfm.geometry.frames import homography_from_pixel_index, homography_to_pixel_index
+from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.synthetic.textures import make_texture
 from hm_sfm.types import PatchMatches, PinholeView
 

@@ -8,8 +8,8 @@ import warnings
 import numpy as np
 import pytest
 
-from hm_sfm.evaluation.comparison import Comparison, MethodResult
 from hm_sfm.errors import MissingPackageError
+from hm_sfm.evaluation.comparison import Comparison, MethodResult
 from hm_sfm.evaluation.comparison_report import format_table, lay_out_histogram, plot_tracks, require_plots, write_json
 
 GOOD = MethodResult(

@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from hm_sfm.io import batches
-from hm_sfm.pairs import retrieval
 from hm_sfm.config import Config, ImageConfig, MatchingConfig, NetworkConfig, PairConfig
 from hm_sfm.errors import InputError
-from hm_sfm.photos.images import CV_ROTATIONS, prepare_array, read_ref
+from hm_sfm.io import batches
 from hm_sfm.matching.matcher import HomoMatcher, HomoNet
-from hm_sfm.pairs.selection import select_pairs
-from hm_sfm.pipeline.reconstruction import choose_pairs
+from hm_sfm.pairs import retrieval
 from hm_sfm.pairs.retrieval import (
     CELLS_PER_IMAGE,
     CellStore,
@@ -24,6 +21,9 @@ from hm_sfm.pairs.retrieval import (
     sample_cells,
     weigh_words,
 )  # fmt: skip
+from hm_sfm.pairs.selection import select_pairs
+from hm_sfm.photos.images import CV_ROTATIONS, prepare_array, read_ref
+from hm_sfm.pipeline.reconstruction import choose_pairs
 from hm_sfm.synthetic.textures import make_texture
 from hm_sfm.types import ImageRef
 

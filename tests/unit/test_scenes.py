@@ -280,7 +280,7 @@ def test_items_are_deterministic_and_of_one_form(photos):
     assert item["images"].shape == (2, SIZE_WH[1], SIZE_WH[0]) and item["images"].dtype == np.uint8
     assert item["b_from_a"].shape == (SURFACES, 3, 3) and item["b_from_a"].dtype == np.float32
     assert item["surface"].shape == (SIZE_WH[1], SIZE_WH[0]) and item["surface"].dtype == np.int64
-    assert -1 <= item["surface"].min() and item["surface"].max() < SURFACES
+    assert item["surface"].min() >= -1 and item["surface"].max() < SURFACES
     assert item["points"].shape == (POINTS, 4) and np.isnan(item["points"]).all()
     for key in item:
         assert np.array_equal(item[key], again[4][key], equal_nan=key == "points")

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hm_sfm.matching.run as matching
-from hm_sfm.matching.run import match_pairs
 from hm_sfm.matching.order import count_loads, order_pairs
+from hm_sfm.matching.run import match_pairs
 from hm_sfm.types import ImagePair, ImageRef, PatchMatches
 
 

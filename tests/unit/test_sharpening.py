@@ -6,16 +6,23 @@ import cv2
 import numpy as np
 import pytest
 
-from hm_sfm.keypoints import refinement as sharpening
 from hm_sfm.config import ImageConfig, KeypointConfig, MatchingConfig
-from hm_sfm.geometry.frames import homography_to_pixel_index
 from hm_sfm.errors import ConfigError
-from hm_sfm.photos.images import prepare_image, read_ref
-from hm_sfm.keypoints.propagation import PropagatedPoints, KeypointGraph, TrackEdges, Photo, differentiate, finish_keypoints
-from hm_sfm.network.fine import ExpectationHead
-from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.geometry.frames import homography_to_pixel_index
+from hm_sfm.keypoints import refinement as sharpening
+from hm_sfm.keypoints.propagation import (
+    KeypointGraph,
+    Photo,
+    PropagatedPoints,
+    TrackEdges,
+    differentiate,
+    finish_keypoints,
+)
 from hm_sfm.keypoints.refinement import encode_for_refinement, fit_hypotheses, refine_keypoints
+from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.store import digest_image
+from hm_sfm.network.fine import ExpectationHead
+from hm_sfm.photos.images import prepare_image, read_ref
 from hm_sfm.types import apply_homographies
 
 SIZE_WH = (768, 576)
@@ -77,7 +84,9 @@ def link_photos(photos, wrong: int = 0) -> KeypointGraph:
 
 def sharpen(graph, photos, matcher, folder, made_by=None, refine_long_edge_px: int = SIZE_WH[0]) -> KeypointGraph:
     digests = {photo.name: digest_image(photo) for photo in photos}
-    return refine_keypoints(graph, photos, matcher, refine_long_edge_px, folder / "refined.h5", made_by or {}, digests, quiet=True)
+    return refine_keypoints(
+        graph, photos, matcher, refine_long_edge_px, folder / "refined.h5", made_by or {}, digests, quiet=True
+    )
 
 
 def measure_errors(graph: KeypointGraph) -> np.ndarray:
@@ -150,7 +159,9 @@ def test_photos_of_the_matching_resolution_keep_their_units(photos, matcher, tmp
     small = tuple(dataclasses.replace(photo, px_scale=1.0) for photo in graph.photos)
     xy = tuple(xy * UNIT for xy in graph.xy)
     links = tuple(
-        dataclasses.replace(part, propagated=dataclasses.replace(part.propagated, predicted=part.propagated.predicted * UNIT))
+        dataclasses.replace(
+            part, propagated=dataclasses.replace(part.propagated, predicted=part.propagated.predicted * UNIT)
+        )
         for part in graph.links
     )
     result = sharpen(KeypointGraph(small, xy, links), photos, matcher, tmp_path)

@@ -195,7 +195,7 @@ def test_matches_of_other_photos_are_refused(tmp_path, batch):
     store = open_store(tmp_path)
     store.write(batch)
     with pytest.raises(StaleResultError, match="other photos"):
-        open_store(tmp_path, digests={name: "e" * 16 for name in NAMES})
+        open_store(tmp_path, digests=dict.fromkeys(NAMES, "e" * 16))
 
 
 @pytest.mark.parametrize("where", ["matches.h5", "matches.h5.parts/000000.h5"])

@@ -9,29 +9,29 @@ import numpy as np
 import pytest
 from tqdm import tqdm
 
-from hm_sfm.matching.coarse_matches import read_rgb
 from hm_sfm.config import ImageConfig, MatchingConfig
 from hm_sfm.geometry.frames import pixel_index_from_px, rotation_matrix
-from hm_sfm.photos.images import CV_ROTATIONS, prepare_array, prepare_image, read_ref
-from hm_sfm.matching.run import FeatureCache
-from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.synthetic.textures import MATERIALS, make_texture
-from hm_sfm.types import ImagePair, PatchMatches, apply_homographies
+from hm_sfm.matching.coarse_matches import read_rgb
 from hm_sfm.matching.hypotheses import (
-    UNCHANGED,
     FEW_MATCHES,
-    SCALES,
-    ROTATIONS,
     IDENTITY,
-    Sketch,
+    ROTATIONS,
+    SCALES,
+    UNCHANGED,
     Hypothesis,
+    Sketch,
+    apply_hypothesis,
     choose_hypotheses,
     count_agreeing,
     count_good,
     place_cells,
     relate_scales,
-    apply_hypothesis,
 )
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.matching.run import FeatureCache
+from hm_sfm.photos.images import CV_ROTATIONS, prepare_array, prepare_image, read_ref
+from hm_sfm.synthetic.textures import MATERIALS, make_texture
+from hm_sfm.types import ImagePair, PatchMatches, apply_homographies
 
 SHIFT = np.array([[1, 0, -13], [0, 1, -9], [0, 0, 1.0]])
 """Px of `photo` -> px of `other`."""
@@ -176,7 +176,7 @@ def test_neither_order_nor_memory_matter(matcher, folder, one_thread):
 
 
 def test_given_matches_of_turned_photos_become_homographies(matcher, folder, tmp_path):
-    """px of a.png -> px of b.png: crops of `photo` and `other`, the latter turned."""
+    """Px of a.png -> px of b.png: crops of `photo` and `other`, the latter turned."""
     between = np.array([[1, 0, 7], [0, 1, -9], [0, 0, 1.0]])
     truth = rotation_matrix((160, 128), 90) @ between
     xy0 = np.stack(np.meshgrid(np.arange(20.0, 140, 7), np.arange(20.0, 120, 7)), axis=-1).reshape(-1, 2)
@@ -222,7 +222,10 @@ def test_providers_that_read_the_photo_read_it_turned(tmp_path):
 def test_each_way_is_compared_once():
     ways = ROTATIONS + SCALES
     assert ways[0] == UNCHANGED and len(ways) == len(set(ways)) == 4 + 4 * 4
-    assert all(hypothesis0.rotation_deg == 0 and 1 in (hypothesis0.downscale, hypothesis1.downscale) for hypothesis0, hypothesis1 in ways)
+    assert all(
+        hypothesis0.rotation_deg == 0 and 1 in (hypothesis0.downscale, hypothesis1.downscale)
+        for hypothesis0, hypothesis1 in ways
+    )
 
 
 def test_scales_of_sketches_are_scales_of_photos():

@@ -379,7 +379,8 @@ def run_frames(options: argparse.Namespace) -> int:
 
 
 def run_demo(options: argparse.Namespace) -> int:
-    from hm_sfm.evaluation.poses import read_strecha_cameras, score_model
+    from hm_sfm.evaluation.poses import score_model
+    from hm_sfm.formats.strecha import read_strecha_cameras
     from hm_sfm.pipeline.reconstruction import claim_folder, reconstruct
     from hm_sfm.synthetic.demo import write_demo
 
@@ -415,15 +416,11 @@ def run_show(options: argparse.Namespace) -> int:
 
 
 def run_evaluate(options: argparse.Namespace) -> int:
+    from hm_sfm.evaluation.homographies import score_homographies
+    from hm_sfm.evaluation.match_pictures import MatchPictures
     from hm_sfm.evaluation.points import score_points
-    from hm_sfm.evaluation.relative_poses import (
-        read_strecha_pairs,
-        read_superglue_pairs,
-        score_homographies,
-        score_poses,
-    )
+    from hm_sfm.evaluation.relative_poses import read_strecha_pairs, read_superglue_pairs, score_poses
     from hm_sfm.matching.matcher import HomoMatcher
-    from hm_sfm.report.drawn_matches import MatchPictures
     from hm_sfm.training.photos import load_photos
     from hm_sfm.training.validation import make_validation_pairs
 

@@ -184,6 +184,21 @@ class IndexMatches:
             if len(np.unique(self.indices[:, side])) != count:
                 raise ValueError(f"indices of {self.pair} are not one to one on side {side}")
 
+    @classmethod
+    def of_best(cls, pair: ImagePair, indices: np.ndarray, score: np.ndarray) -> "IndexMatches":
+        """The matches that are the best-scored ones of both their keypoints, the first of equal ones, in their order.
+
+        indices: (M, 2) int, in which keypoints may repeat; score: (M,), higher is better.
+        """
+        order = np.argsort(-score, kind="stable")
+        kept = np.ones(len(score), bool)
+        for side in range(2):
+            _, first = np.unique(indices[order, side], return_index=True)
+            is_best = np.zeros(len(score), bool)
+            is_best[order[first]] = True
+            kept &= is_best
+        return cls(pair, indices[kept], score[kept])
+
     def __len__(self) -> int:
         return len(self.score)
 

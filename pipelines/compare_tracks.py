@@ -18,7 +18,8 @@ from hm_sfm.colmap.verification import verify_database, verify_pairs
 from hm_sfm.config import Config
 from hm_sfm.evaluation.comparison import load_expectation, load_matcher, read_tracks
 from hm_sfm.evaluation.loftr_style import make_keypoints
-from hm_sfm.evaluation.poses import read_strecha_cameras, score_model
+from hm_sfm.evaluation.poses import score_model
+from hm_sfm.formats.strecha import read_strecha_cameras
 from hm_sfm.matching.run import match_pairs
 from hm_sfm.matching.store import MatchStore, digest_image
 from hm_sfm.photos.images import list_images

@@ -18,7 +18,7 @@ from hm_sfm.colmap.mapping import map_incrementally, summarise_models
 from hm_sfm.colmap.verification import verify_database
 from hm_sfm.config import Config
 from hm_sfm.formats.hloc import read_features, read_matches, write_features, write_matches
-from hm_sfm.pairs.selection import read_pairs, write_pairs
+from hm_sfm.formats.pairs_files import read_pairs, write_pairs
 from hm_sfm.photos.images import list_images
 from hm_sfm.pipeline.reconstruction import match_photos, measure_px_scales, verify_and_propagate
 

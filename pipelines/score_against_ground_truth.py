@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from hm_sfm.config import CameraConfig, Config
-from hm_sfm.evaluation.poses import measure_position_error, read_strecha_cameras, score_model
+from hm_sfm.evaluation.poses import measure_position_error, score_model
+from hm_sfm.formats.strecha import read_strecha_cameras
 from hm_sfm.pipeline.reconstruction import reconstruct
 
 AUC_SHOWN_DEG = (0.25, 0.5, 1, 3, 5)

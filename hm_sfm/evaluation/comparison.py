@@ -25,8 +25,10 @@ from hm_sfm.config import Config, fingerprint
 from hm_sfm.errors import ConfigError, InputError, NoModelError
 from hm_sfm.evaluation.loftr import LoftrMatcher
 from hm_sfm.evaluation.loftr_style import make_keypoints
-from hm_sfm.evaluation.poses import read_strecha_cameras, score_model
+from hm_sfm.evaluation.poses import score_model
 from hm_sfm.formats.hloc import read_features, read_matches
+from hm_sfm.formats.pairs_files import write_pairs
+from hm_sfm.formats.strecha import read_strecha_cameras
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.io.locks import release_locks
 from hm_sfm.keypoints.tracks import build_tracks, label_tracks, read_tracks
@@ -34,7 +36,6 @@ from hm_sfm.matching.coarse_matches import check_coarse
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.run import match_pairs
 from hm_sfm.matching.store import MatchStore, digest_image
-from hm_sfm.pairs.selection import write_pairs
 from hm_sfm.photos.images import list_images
 from hm_sfm.photos.masks import NO_MASKS, MaskedStore, Masks, read_masks
 from hm_sfm.pipeline.reconstruction import (

@@ -68,9 +68,7 @@ def make_keypoints(
         indices = np.stack([index_of[name][turn[name]] for name in (pair.name0, pair.name1)], axis=1)
         strength = score[pair.name0][turn[pair.name0]]
         placed = np.all(indices >= 0, axis=1)
-        indices, strength = indices[placed], strength[placed]
-        kept = keep_best(indices, strength)
-        matches.append(IndexMatches(pair, indices[kept], strength[kept]))
+        matches.append(IndexMatches.of_best(pair, indices[placed], strength[placed]))
     return tuple(keypoints), tuple(matches)
 
 
@@ -115,18 +113,3 @@ def keep_most_voted(position: np.ndarray, votes: np.ndarray, budget: int) -> tup
     """The `budget` positions (K, 2) with most votes (K,), the first of equal ones, in their order; and their votes."""
     kept = np.sort(np.argsort(-votes, kind="stable")[:budget])
     return position[kept], votes[kept]
-
-
-def keep_best(indices: np.ndarray, score: np.ndarray) -> np.ndarray:
-    """(M,) bool: the matches that are the best-scored ones of both their keypoints, the first of equal ones.
-
-    indices: (M, 2) int; score: (M,). What is kept is one to one.
-    """
-    order = np.argsort(-score, kind="stable")
-    kept = np.ones(len(score), bool)
-    for side in range(2):
-        _, first = np.unique(indices[order, side], return_index=True)
-        best = np.zeros(len(score), bool)
-        best[order[first]] = True
-        kept &= best
-    return kept

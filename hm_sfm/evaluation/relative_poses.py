@@ -1,6 +1,6 @@
-"""How good matches of single pairs are: relative poses and homographies estimated from them, against the truth.
+"""How good matches of single pairs are: the relative poses estimated from them, against the ground truth.
 
-The protocols are LoFTR's (Sun et al., CVPR 2021, section 4), which HomoMatcher's tables follow.
+The protocol is LoFTR's (Sun et al., CVPR 2021, section 4), which HomoMatcher's tables follow.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,23 +14,14 @@ import pycolmap
 from tqdm import tqdm
 
 from hm_sfm.errors import InputError
-from hm_sfm.evaluation.poses import (
-    measure_angle_deg,
-    measure_rotation_deg,
-    pose_auc,
-    read_strecha_cameras,
-    relative_pose,
-)
-from hm_sfm.geometry.frames import homography_from_pixel_index
-from hm_sfm.matching.matcher import HomoMatcher, ImageFeatures
+from hm_sfm.evaluation.poses import measure_angle_deg, measure_rotation_deg, pose_auc, relative_pose
+from hm_sfm.formats.strecha import read_strecha_cameras
+from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.photos.images import prepare_image, read_ref
 from hm_sfm.types import PatchMatches, freeze_array
 
 POSE_THRESHOLDS_DEG = (5, 10, 20)
-CORNER_THRESHOLDS_PX = (3, 5, 10)
 ESSENTIAL_ERROR_PX = 0.5
-HOMOGRAPHY_ERROR_PX = 3.0
-HPATCHES_SHORT_EDGE_PX = 480
 
 
 @dataclass(frozen=True)
@@ -69,7 +60,7 @@ def read_strecha_pairs(scene: Path) -> list[PosePair]:
     Raises InputError where a part is missing or malformed.
     """
     scene = Path(scene)
-    truth = read_strecha_cameras(scene / "gt_dense_cameras")
+    ground_truth = read_strecha_cameras(scene / "gt_dense_cameras")
     try:
         k = np.loadtxt(scene / "K.txt").reshape(3, 3)
     except (OSError, ValueError) as error:
@@ -80,16 +71,16 @@ def read_strecha_pairs(scene: Path) -> list[PosePair]:
             scene / "images" / name1,
             k,
             k,
-            relative_pose(truth[name0].cam_from_world, truth[name1].cam_from_world),
+            relative_pose(ground_truth[name0].cam_from_world, ground_truth[name1].cam_from_world),
         )
-        for name0, name1 in combinations(sorted(truth), 2)
+        for name0, name1 in combinations(sorted(ground_truth), 2)
     ]
 
 
 def read_superglue_pairs(path: Path, image_folder: Path) -> list[PosePair]:
-    """Pairs in SuperGlue's pairs_with_gt format: two names, two EXIF turns, K0, K1 and cam1_from_cam0, a line each.
+    """Pairs in SuperGlue's pairs_with_gt format.
 
-    Their K counts the centre of the top-left pixel as (0, 0). Raises InputError on a malformed line.
+    A line holds two names, two EXIF rotations, K0, K1 and cam1_from_cam0. Their K counts the centre of the top-left pixel as (0, 0). Raises InputError on a malformed line.
     """
     try:
         lines = Path(path).read_text().splitlines()
@@ -196,78 +187,13 @@ def estimate_pose_colmap(
     )
     options = pycolmap.RANSACOptions(max_error=max_error_px, random_seed=0)
     xy0, xy1 = matches.xy0.astype(np.float64), matches.xy1.astype(np.float64)
-    found = pycolmap.estimate_essential_matrix(xy0, xy1, camera0, camera1, options)
-    return None if found is None else found["cam2_from_cam1"].matrix()
+    estimate = pycolmap.estimate_essential_matrix(xy0, xy1, camera0, camera1, options)
+    return None if estimate is None else estimate["cam2_from_cam1"].matrix()
 
 
-def measure_pose_error(found: np.ndarray | None, true: np.ndarray) -> float:
+def measure_pose_error(estimate: np.ndarray | None, true: np.ndarray) -> float:
     """Degrees: the larger of rotation error and translation-direction error up to its sign; inf for no pose."""
-    if found is None:
+    if estimate is None:
         return np.inf
-    direction_deg = measure_angle_deg(found[:, 3], true[:, 3])
-    return max(measure_rotation_deg(found[:, :3], true[:, :3]), min(direction_deg, 180 - direction_deg))
-
-
-def score_homographies(
-    matcher: HomoMatcher,
-    folder: Path,
-    quiet: bool = False,
-    observe: Callable[[Path, Path, np.ndarray, PatchMatches], None] | None = None,
-) -> dict[str, float]:
-    """Match the pairs of a folder in HPatches' layout and estimate the homographies between the images.
-
-    folder: a subfolder a sequence with images 1.* to 6.* and H_1_2 to H_1_6. Short edges are reduced to 480 px.
-    observe: called with the two paths, the true homography (3, 3) between the stored images, and the matches of each
-    pair. Returns the AUC of the mean corner error at 3, 5 and 10 px of the reduced image 1, in percent, and the mean
-    number of matches. Raises InputError where the layout is another.
-    """
-    sequences = sorted(path.parent for path in Path(folder).glob("*/H_1_2"))
-    if not sequences:
-        raise InputError(f"{folder} is no folder in HPatches' layout: no */H_1_2 there")
-    errors, counts = [], []
-    for sequence in tqdm(sequences, desc="homographies", unit="sequence", disable=quiet):
-        path0 = _find_image(sequence, 1)
-        features0, size_wh, _ = _encode_short_edge(matcher, path0)
-        for number in range(2, 7):
-            path1 = _find_image(sequence, number)
-            features1, _, px_scale1 = _encode_short_edge(matcher, path1)
-            matches = matcher.match_features(features0, features1)
-            truth = homography_from_pixel_index(np.loadtxt(sequence / f"H_1_{number}"))
-            if observe is not None:
-                observe(path0, path1, truth, matches)
-            counts.append(len(matches))
-            errors.append(_measure_corner_error(matches, truth, size_wh, px_scale1))
-    scores = {f"auc_{limit}px": area for limit, area in pose_auc(np.array(errors), CORNER_THRESHOLDS_PX).items()}
-    return scores | {"mean_matches": float(np.mean(counts))}
-
-
-def _find_image(sequence: Path, number: int) -> Path:
-    path = next(iter(sorted(sequence.glob(f"{number}.*"))), None)
-    if path is None:
-        raise InputError(f"{sequence} lacks the image {number}.*")
-    return path
-
-
-def _encode_short_edge(matcher: HomoMatcher, path: Path) -> tuple[ImageFeatures, tuple[int, int], float]:
-    """Features, stored size (w, h) px and stored px per reduced px of an image."""
-    ref = read_ref(path)
-    px_scale = max(1.0, min(ref.size_wh) / HPATCHES_SHORT_EDGE_PX)
-    features = matcher.encode(prepare_image(ref, round(max(ref.size_wh) / px_scale)))
-    return features, ref.size_wh, px_scale
-
-
-def _measure_corner_error(
-    matches: PatchMatches, truth: np.ndarray, size_wh: tuple[int, int], px_scale1: float
-) -> float:
-    """Mean distance of image 0's corners under the estimated and the true homography, px of the reduced image 1."""
-    if len(matches) < 4:
-        return np.inf
-    xy0, xy1 = matches.xy0.astype(np.float64), matches.xy1.astype(np.float64)
-    found, _ = cv2.findHomography(xy0, xy1, cv2.RANSAC, HOMOGRAPHY_ERROR_PX * px_scale1)
-    if found is None:
-        return np.inf
-    width, height = size_wh
-    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], dtype=np.float64)
-    mapped = [corners @ homography.T for homography in (found, truth)]
-    apart = mapped[0][:, :2] / mapped[0][:, 2:] - mapped[1][:, :2] / mapped[1][:, 2:]
-    return float(np.linalg.norm(apart, axis=1).mean() / px_scale1)
+    direction_deg = measure_angle_deg(estimate[:, 3], true[:, 3])
+    return max(measure_rotation_deg(estimate[:, :3], true[:, :3]), min(direction_deg, 180 - direction_deg))

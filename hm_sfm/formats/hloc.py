@@ -15,7 +15,6 @@ import h5py
 import numpy as np
 
 from hm_sfm.errors import InputError
-from hm_sfm.evaluation.loftr_style import keep_best
 from hm_sfm.geometry.frames import pixel_index_from_px, px_from_pixel_index
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
@@ -158,8 +157,7 @@ def read_pair(
                 f"{path} matches keypoint {indices[:, side].max()} of {name!r}, which has {count_of[name]}: it is not "
                 "of the same run as the keypoints"
             )
-    kept = keep_best(indices, score)
-    return IndexMatches(pair, indices[kept], score[kept])
+    return IndexMatches.of_best(pair, indices, score)
 
 
 def name_group(name0: str, name1: str, separator: str = "/") -> str:

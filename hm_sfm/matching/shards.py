@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hm_sfm.errors import InputError
+from hm_sfm.formats.pairs_files import write_pairs
 from hm_sfm.io.locks import lock_file
 from hm_sfm.matching.order import order_pairs
 from hm_sfm.matching.store import MatchStore
-from hm_sfm.pairs.selection import write_pairs
 from hm_sfm.types import ImagePair
 
 CACHED_IMAGES = 32

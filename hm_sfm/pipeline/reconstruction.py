@@ -24,6 +24,7 @@ from hm_sfm.colmap.verification import VerifiedPair, verify_database, verify_pai
 from hm_sfm.config import Config, fingerprint
 from hm_sfm.errors import InputError, NoModelError
 from hm_sfm.formats.hloc import write_features, write_matches
+from hm_sfm.formats.pairs_files import read_pairs, write_pairs
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.io.locks import lock_file, release_locks, wait_in_line
 from hm_sfm.keypoints.propagation import (
@@ -41,7 +42,7 @@ from hm_sfm.matching.run import check_engine, match_pairs
 from hm_sfm.matching.shards import Shard, merge_shards, refuse_shards
 from hm_sfm.matching.store import MatchStore, digest_image
 from hm_sfm.pairs.retrieval import CellStore, describe_images, find_similar
-from hm_sfm.pairs.selection import read_pairs, select_pairs, write_pairs
+from hm_sfm.pairs.selection import select_pairs
 from hm_sfm.photos.images import list_images, prepare_image
 from hm_sfm.photos.masks import NO_MASKS, MaskedStore, Masks, read_masks
 from hm_sfm.report.diagnosis import Diagnosis, diagnose

@@ -1,73 +1,17 @@
-"""Match pictures: two images side by side and a sample of their matches, coloured by error from green to red."""
-
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+"""Drawn matches: two images side by side and a sample of their matches, coloured by error from green to red."""
 
 import cv2
 import numpy as np
 
-from hm_sfm.evaluation.relative_poses import PosePair
-from hm_sfm.io.atomic import replace_file
-from hm_sfm.photos.images import PreparedImage, prepare_image, read_ref
-from hm_sfm.types import PatchMatches, apply_homographies
+from hm_sfm.photos.images import PreparedImage
+from hm_sfm.types import apply_homographies
 
-LONG_EDGE_PX = 1024
-"""Of each photo in a picture."""
 WORST_PX = 5.0
 """Errors from here on are red."""
 MOST_LINES = 300
 GAP_PX = 8
 SUBPIXEL_BITS = 4
 GREY = (150, 150, 150)
-
-
-@dataclass
-class MatchPictures:
-    """A folder of PNG files, numbered as they are drawn; the methods suit `observe` of the evaluations."""
-
-    folder: Path
-    count: int = 0
-
-    def __post_init__(self) -> None:
-        self.folder = Path(self.folder)
-        self.folder.mkdir(parents=True, exist_ok=True)
-
-    def draw_points(self, images: Sequence[np.ndarray], matches: PatchMatches, error_px: np.ndarray) -> None:
-        """The matches of two grey images (H, W) uint8, error_px (M,) NaN where there is no truth."""
-        self._write("pair", draw_matches(images[0], images[1], matches.xy0, matches.xy1, error_px))
-
-    def draw_poses(self, pair: PosePair, matches: PatchMatches) -> None:
-        """The matches of two photos, with their epipolar errors against the true pose, px of the picture."""
-        self._draw_photos(pair.path0, pair.path1, matches, measure_epipolar_error(matches, pair))
-
-    def draw_homography(self, path0: Path, path1: Path, truth: np.ndarray, matches: PatchMatches) -> None:
-        """The matches of two photos, with their errors against the homography truth (3, 3), px of photo 0 -> 1."""
-        true = apply_homographies(np.broadcast_to(truth, (len(matches), 3, 3)), matches.xy0)
-        self._draw_photos(path0, path1, matches, np.linalg.norm(true - matches.xy1, axis=1))
-
-    def _draw_photos(self, path0: Path, path1: Path, matches: PatchMatches, error_px: np.ndarray) -> None:
-        """error_px: (M,) px of stored image 1."""
-        photos = [prepare_image(read_ref(path), LONG_EDGE_PX) for path in (path0, path1)]
-        picture = draw_photo_matches(*photos, matches.xy0, matches.xy1, error_px)
-        self._write(f"{path0.stem}-{path1.stem}", picture)
-
-    def _write(self, name: str, picture: np.ndarray) -> None:
-        _, code = cv2.imencode(".png", picture)
-        with replace_file(self.folder / f"{self.count:04d}_{name}.png") as temporary:
-            temporary.write_bytes(code.tobytes())
-        self.count += 1
-
-
-def measure_epipolar_error(matches: PatchMatches, pair: PosePair) -> np.ndarray:
-    """(M,) float64 px of the stored images: Sampson's distance of the matches from the true epipolar geometry."""
-    rotation, translation = pair.cam1_from_cam0[:, :3], pair.cam1_from_cam0[:, 3]
-    cross = np.array([np.cross(translation, axis) for axis in np.eye(3)]).T
-    fundamental = np.linalg.inv(pair.k1).T @ cross @ rotation @ np.linalg.inv(pair.k0)
-    points0, points1 = (np.column_stack([xy, np.ones(len(xy))]) for xy in (matches.xy0, matches.xy1))
-    lines1, lines0 = points0 @ fundamental.T, points1 @ fundamental
-    steepness = np.linalg.norm(np.column_stack([lines1[:, :2], lines0[:, :2]]), axis=1)
-    return np.abs((points1 * lines1).sum(axis=1)) / np.maximum(steepness, 1e-12)
 
 
 def draw_photo_matches(

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hm_sfm.evaluation.poses import write_strecha_cameras
+from hm_sfm.formats.strecha import write_strecha_cameras
 from hm_sfm.photos.exif import write_jpeg
 from hm_sfm.synthetic.rendering import Quad, render_view
 from hm_sfm.synthetic.textures import make_texture

@@ -15,7 +15,7 @@ import yaml
 
 import hm_sfm
 from hm_sfm.cli import main, make_parser
-from hm_sfm.evaluation.poses import write_strecha_cameras
+from hm_sfm.formats.strecha import write_strecha_cameras
 from hm_sfm.network.backbone import XFeatTrunk
 
 COMMANDS = (

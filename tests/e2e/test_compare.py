@@ -14,7 +14,7 @@ from kornia.feature import LoFTR
 
 from hm_sfm.cli import main
 from hm_sfm.formats.hloc import read_features, read_matches
-from hm_sfm.pairs.selection import read_pairs
+from hm_sfm.formats.pairs_files import read_pairs
 from hm_sfm.photos.images import list_images
 
 STYLES = ("raw", "1px", "2px", "4px", "8px")

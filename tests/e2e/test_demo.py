@@ -12,8 +12,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hm_sfm.evaluation.poses import ModelScore, read_strecha_cameras, score_model
-from hm_sfm.pairs.selection import read_pairs
+from hm_sfm.evaluation.poses import ModelScore, score_model
+from hm_sfm.formats.pairs_files import read_pairs
+from hm_sfm.formats.strecha import read_strecha_cameras
 from hm_sfm.synthetic.demo import write_demo
 
 # A process that stores each pair at once instead of every 20 s, and that minds Ctrl-C even where the tests were

@@ -14,7 +14,7 @@ from plyfile import PlyData
 from hm_sfm.colmap.database import Cameras, write_database
 from hm_sfm.errors import InputError
 from hm_sfm.export.conversion import convert_run, flatten_names
-from hm_sfm.pairs.selection import write_pairs
+from hm_sfm.formats.pairs_files import write_pairs
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 WIDTH, HEIGHT = 320, 240

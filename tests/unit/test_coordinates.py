@@ -4,7 +4,13 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hm_sfm.geometry.frames import Grid, px_from_pixel_index, rotation_matrix
+from hm_sfm.geometry.frames import (
+    Grid,
+    homography_from_pixel_index,
+    homography_to_pixel_index,
+    px_from_pixel_index,
+    rotation_matrix,
+)
 
 sides = st.integers(1, 5000)
 rotations = st.sampled_from((0, 90, 180, 270))
@@ -72,3 +78,10 @@ def test_grid_round_trip(stride, offset, cells):
 def test_a_pooled_grid_has_its_cells_at_the_mean_of_their_pixel_centres():
     pixel_centres = px_from_pixel_index(np.arange(32.0))
     assert np.array_equal(Grid(8, 4.0).to_px(np.arange(4.0)), pixel_centres.reshape(4, 8).mean(1))
+
+
+def test_pixel_index_homographies_convert_there_and_back():
+    homography = np.array([[1.1, 0.02, 5], [-0.03, 0.9, 7], [1e-4, -2e-4, 1]])
+    assert np.allclose(homography_to_pixel_index(homography_from_pixel_index(homography)), homography)
+    shift = homography_from_pixel_index(np.diag([2.0, 2.0, 1.0]))
+    assert np.allclose(shift @ [0.5, 0.5, 1], [0.5, 0.5, 1])

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hm_sfm.evaluation.loftr_style import keep_best, keep_most_voted, make_keypoints, merge_duplicates, snap_points
+from hm_sfm.evaluation.loftr_style import keep_most_voted, make_keypoints, merge_duplicates, snap_points
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
 
@@ -196,19 +196,6 @@ def test_matches_are_one_to_one_and_the_best_score_wins():
     rows = [(8.1, 8, 50, 50, 0.3), (8.2, 8, 60, 60, 0.9), (40, 40, 60.3, 60, 0.5)]
     _, matches = make_collection("ab", make_matches("a", "b", rows), cell_px=1)
     np.testing.assert_array_equal(matches["ab"].score, np.float32([0.9]))
-
-
-@pytest.mark.parametrize(
-    ("indices", "score", "kept"),
-    [
-        ([(0, 0), (0, 1), (1, 1)], [0.5, 0.9, 0.8], [1]),
-        ([(0, 0), (1, 0)], [0.5, 0.5], [0]),
-        ([(0, 1), (1, 0)], [0.1, 0.9], [0, 1]),
-        (np.zeros((0, 2), int), [], []),
-    ],
-)
-def test_best_matches(indices, score, kept):
-    np.testing.assert_array_equal(np.flatnonzero(keep_best(np.array(indices), np.array(score))), kept)
 
 
 @pytest.mark.parametrize("cell_px", [None, 1, 8])

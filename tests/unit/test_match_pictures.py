@@ -2,8 +2,9 @@ import cv2
 import numpy as np
 import pytest
 
+from hm_sfm.evaluation.match_pictures import MatchPictures, measure_epipolar_error
 from hm_sfm.evaluation.relative_poses import PosePair
-from hm_sfm.report.drawn_matches import GAP_PX, MatchPictures, draw_matches, measure_epipolar_error, pick_colour
+from hm_sfm.report.drawn_matches import GAP_PX, draw_matches, pick_colour
 from hm_sfm.types import PatchMatches
 
 K0 = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])

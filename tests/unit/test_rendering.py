@@ -3,7 +3,7 @@ import pycolmap
 import pytest
 
 import hm_sfm.synthetic.demo
-from hm_sfm.evaluation.poses import read_strecha_cameras
+from hm_sfm.formats.strecha import read_strecha_cameras
 from hm_sfm.synthetic.demo import expose_photo, make_box, make_demo_scene, make_demo_views, write_demo
 from hm_sfm.synthetic.rendering import Quad, render_view
 from hm_sfm.synthetic.textures import MATERIALS, make_texture

@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 
 from hm_sfm.errors import InputError
-from hm_sfm.evaluation.poses import write_strecha_cameras
 from hm_sfm.evaluation.relative_poses import (
     PointMatches,
     PosePair,
@@ -12,12 +11,9 @@ from hm_sfm.evaluation.relative_poses import (
     measure_pose_error,
     read_strecha_pairs,
     read_superglue_pairs,
-    score_homographies,
     score_pose_matches,
 )
-from hm_sfm.geometry.frames import homography_from_pixel_index, homography_to_pixel_index
-from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.synthetic.textures import make_texture
+from hm_sfm.formats.strecha import write_strecha_cameras
 from hm_sfm.types import PatchMatches, PinholeView
 
 K0 = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
@@ -84,13 +80,6 @@ def test_a_pose_error_is_the_larger_angle_and_ignores_the_sign_of_the_translatio
     assert measure_pose_error(make_pose(0, (1, 1, 0)), pose) == pytest.approx(45)
 
 
-def test_pixel_index_homographies_convert_there_and_back():
-    homography = np.array([[1.1, 0.02, 5], [-0.03, 0.9, 7], [1e-4, -2e-4, 1]])
-    assert np.allclose(homography_to_pixel_index(homography_from_pixel_index(homography)), homography)
-    shift = homography_from_pixel_index(np.diag([2.0, 2.0, 1.0]))
-    assert np.allclose(shift @ [0.5, 0.5, 1], [0.5, 0.5, 1])
-
-
 def test_superglue_pairs_move_into_colmaps_frame(tmp_path):
     pose = np.eye(4)
     pose[0, 3] = 2
@@ -121,24 +110,3 @@ def test_strecha_scenes_give_all_pairs(tmp_path):
     pairs = read_strecha_pairs(tmp_path)
     assert [(p.path0.name, p.path1.name) for p in pairs] == [("0.jpg", "1.jpg"), ("0.jpg", "2.jpg"), ("1.jpg", "2.jpg")]
     assert np.allclose(pairs[1].cam1_from_cam0, np.column_stack([np.eye(3), [-2, 0, 0]]))
-
-
-@pytest.fixture(scope="module")
-def matcher():
-    return HomoMatcher.from_pretrained("light")
-
-
-def test_homographies_of_a_small_hpatches_folder(tmp_path, matcher):
-    image = make_texture(np.random.default_rng(0), "bricks", (2.4, 1.8), 160)
-    sequence = tmp_path / "v_bricks"
-    sequence.mkdir()
-    cv2.imwrite(str(sequence / "1.png"), image)
-    size_wh = image.shape[1], image.shape[0]
-    for number in range(2, 7):
-        truth = np.array([[1, 0.02 * number, 3], [-0.02 * number, 1, 6], [2e-5 * number, 0, 1]])
-        np.savetxt(sequence / f"H_1_{number}", truth)
-        cv2.imwrite(str(sequence / f"{number}.png"), cv2.warpPerspective(image, truth, size_wh))
-    scores = score_homographies(matcher, tmp_path, quiet=True)
-    assert scores["auc_3px"] > 60 and scores["mean_matches"] > 100
-    with pytest.raises(InputError, match="HPatches"):
-        score_homographies(matcher, sequence, quiet=True)

@@ -1,7 +1,6 @@
 """The command hm-sfm."""
 
 import argparse
-import dataclasses
 import json
 import logging
 import math
@@ -275,13 +274,8 @@ def add_settings(command: argparse.ArgumentParser, example: str) -> None:
 
 def read_config(options: argparse.Namespace) -> Config:
     """The configuration file, then --set, then the options with names of their own."""
-    config = load_config(options.config, tuple(options.settings))
-    for key, value in vars(options).items():
-        if "." in key and value is not None:
-            section, field = key.split(".")
-            part = dataclasses.replace(getattr(config, section), **{field: value})
-            config = dataclasses.replace(config, **{section: part})
-    return config
+    named = {key: value for key, value in vars(options).items() if "." in key and value is not None}
+    return load_config(options.config, tuple(options.settings), options=named)
 
 
 def run_match(options: argparse.Namespace) -> int:

@@ -7,10 +7,11 @@ import dataclasses
 import difflib
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import UnionType
-from typing import Any, get_args, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -19,13 +20,14 @@ from hm_sfm.errors import ConfigError
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """The architecture. A weights file carries its own; a configuration that disagrees is refused."""
+    """The architecture. A weights file holds its own; a configuration that disagrees with it is refused."""
 
-    backbone: str = "light"
-    coarse: str = "cosine"
+    backbone: Literal["light", "loftr"] = "light"
+    """Where the features come from: `light` (XFeat's trunk with a fine branch) or `loftr` (LoFTR's ResNet)."""
+    coarse: Literal["attention", "aspan", "cosine"] = "cosine"
     """`attention` (LoFTR's transformer and dual softmax), `aspan` (ASpanFormer's, which attends around a flow) or
     `cosine` (mutual nearest neighbours of plain features)."""
-    head: str = "homography"
+    head: Literal["homography", "expectation"] = "homography"
     """`homography` (the paper) or `expectation` (LoFTR's point-to-patch baseline)."""
     window: int = 9
     """w: side of a fine patch, cells of the 1/2 grid."""
@@ -37,6 +39,9 @@ class NetworkConfig:
     """Cells by which the patch searched in image 1 is larger on each side (the paper: 0)."""
     spacing: int = 2
     """Cells from one point of image 0's patch that is looked up in image 1 to the next (the paper: 1)."""
+
+    def __post_init__(self) -> None:
+        check_words(self, "network")
 
 
 @dataclass(frozen=True)
@@ -78,8 +83,8 @@ class MatchingConfig:
     model: str = "light"
     """Name of bundled weights, or a file."""
     coarse: str = "light"
-    """What finds the matches to estimate homographies for: light (the network itself) | sift | lightglue | xfeat | a file
-    of weights, of LoFTR or made by hm-sfm train, whose coarse stage does."""
+    """What makes the coarse matches that homographies are estimated for: light (the network itself) | sift | lightglue |
+    xfeat | a file of weights, LoFTR's or made by hm-sfm train, whose coarse stage is used."""
     coarse_matches: str = ""
     """A file with the matches of any matcher instead, as hloc or its match_dense write them;"""
     coarse_features: str = ""
@@ -96,9 +101,13 @@ class MatchingConfig:
     that fits clearly better."""
     feature_cache_mb: int = 1500
     """Per process that matches: two photos at least."""
-    device: str = "auto"
-    engine: str = "serial"
-    """serial, or ray: by the workers of a Ray cluster."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """auto takes the GPU if there is one."""
+    engine: Literal["serial", "ray"] = "serial"
+    """serial matches in this process, ray on the workers of a Ray cluster."""
+
+    def __post_init__(self) -> None:
+        check_words(self, "matching")
 
 
 @dataclass(frozen=True)
@@ -141,8 +150,8 @@ class KeypointConfig:
 
 @dataclass(frozen=True)
 class CameraConfig:
-    mode: str = "auto"
-    """auto | single | per-folder | per-image."""
+    mode: Literal["auto", "single", "per-folder", "per-image"] = "auto"
+    """Which photos share a camera; auto goes by size and EXIF."""
     model: str = "SIMPLE_RADIAL"
     params: str = ""
     """Known intrinsics, `f,...` in the order of COLMAP's camera model; they stay fixed."""
@@ -153,13 +162,19 @@ class CameraConfig:
     rig: str = ""
     """A rig configuration as COLMAP has it: which photos were taken together by cameras that are mounted together."""
 
+    def __post_init__(self) -> None:
+        check_words(self, "cameras")
+
 
 @dataclass(frozen=True)
 class MappingConfig:
-    mapper: str = "incremental"
-    """incremental | global."""
+    mapper: Literal["incremental", "global"] = "incremental"
+    """COLMAP's incremental mapper, image by image, or its global one, all at once."""
     min_model_size: int = 2
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_words(self, "mapping")
 
 
 @dataclass(frozen=True)
@@ -175,32 +190,61 @@ class Config:
     mapping: MappingConfig = field(default_factory=MappingConfig)
 
 
-def parse_config(tree: Any, cls: type, where: str = "the configuration") -> Any:
+RENAMED: dict[type, dict[str, str]] = {
+    MatchingConfig: {"retry_turned": "matching.try_hypotheses"},
+    KeypointConfig: {
+        "carry_score": "keypoints.propagation_min_score",
+        "carry_radius_px": "keypoints.propagation_radius_px",
+        "native_px": "keypoints.refine_long_edge_px",
+    },
+}
+"""Keys of version 0.1.0 by the section that they stood in, and what each is called now."""
+
+
+def parse_config(tree: Any, cls: type, where: str = "", section: str = "") -> Any:
     """Build the dataclass `cls` from a tree of dicts; keys that are left out take their defaults.
 
-    Raises ConfigError on an unknown key (naming the nearest one), a missing one that has no default, and on a value
-    of another type.
+    `where` is the file that messages name, `section` the keys that lead to the tree, with dots between them. Raises
+    ConfigError on an unknown key (naming the nearest one), a renamed one (naming the new one), a missing one that has
+    no default, and on a value of another type or a word that is not among those allowed.
     """
     tree = {} if tree is None else tree
     if not isinstance(tree, dict):
-        raise ConfigError(f"{where} must be a mapping of keys to values, found {tree!r}")
+        raise ConfigError(f"{_describe(where, section)} must be a mapping of keys to values, found {tree!r}")
     types = get_type_hints(cls)
     values = {}
     for key, value in tree.items():
+        dotted = f"{section}.{key}" if section else str(key)
+        if key not in types and key in RENAMED.get(cls, {}):
+            raise ConfigError(f"{_prefix(where)}the key {dotted!r} is now called {RENAMED[cls][key]}")
         if key not in types:
             near = difflib.get_close_matches(str(key), types, n=1, cutoff=0.0)
-            raise ConfigError(f"unknown key {key!r} in {where}: did you mean {near[0]!r}?")
-        values[key] = _parse_value(value, types[key], f"{where}: {key}")
+            raise ConfigError(f"unknown key {str(key)!r} in {_describe(where, section)}: did you mean {near[0]!r}?")
+        values[key] = _parse_value(value, types[key], where, dotted)
     for item in dataclasses.fields(cls):
         required = item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING
         if required and item.name not in values:
-            raise ConfigError(f"{where} lacks the key {item.name!r}")
+            raise ConfigError(f"{_describe(where, section)} lacks the key {item.name!r}")
     return cls(**values)
 
 
-def _parse_value(value: Any, kind: Any, where: str) -> Any:
+def _describe(where: str, section: str) -> str:
+    if not section:
+        return where or "the configuration"
+    return f"{_prefix(where)}{section}"
+
+
+def _prefix(where: str) -> str:
+    return f"{where}: " if where else ""
+
+
+def _parse_value(value: Any, kind: Any, where: str, dotted: str) -> Any:
+    name = f"{_prefix(where)}{dotted}"
     if dataclasses.is_dataclass(kind):
-        return parse_config(value, kind, where)
+        return parse_config(value, kind, where, dotted)
+    if get_origin(kind) is Literal:
+        check_word(value, get_args(kind), name)
+        return value
     if isinstance(kind, UnionType):
         if value is None and type(None) in get_args(kind):
             return None
@@ -208,10 +252,23 @@ def _parse_value(value: Any, kind: Any, where: str) -> Any:
     if kind is float and type(value) is int:
         return float(value)
     if type(value) is not kind:
-        raise ConfigError(f"{where} must be of type {kind.__name__}, found {value!r}")
+        raise ConfigError(f"{name} must be of type {kind.__name__}, found {value!r}")
     if kind in (int, float) and not value >= 0:
-        raise ConfigError(f"{where} must not be negative, found {value!r}")
+        raise ConfigError(f"{name} must not be negative, found {value!r}")
     return value
+
+
+def check_words(config: Any, section: str) -> None:
+    """Raises ConfigError where a field of the dataclass `config` that is a Literal holds none of its words."""
+    for key, kind in get_type_hints(type(config)).items():
+        if get_origin(kind) is Literal:
+            check_word(getattr(config, key), get_args(kind), f"{section}.{key}" if section else key)
+
+
+def check_word(value: Any, allowed: tuple[str, ...], name: str) -> None:
+    """Raises ConfigError where `value` is none of the words `allowed`."""
+    if value not in allowed:
+        raise ConfigError(f"{name} must be {', '.join(allowed[:-1])} or {allowed[-1]}, found {value!r}")
 
 
 def read_yaml(path: Path) -> Any:
@@ -224,30 +281,46 @@ def read_yaml(path: Path) -> Any:
         raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
 
 
-def load_config(path: Path | None = None, settings: tuple[str, ...] = (), cls: type = Config) -> Any:
-    """Read a configuration file, then apply `section.key=value` settings (values are YAML).
+def load_config(
+    path: Path | None = None,
+    settings: tuple[str, ...] = (),
+    cls: type = Config,
+    options: Mapping[str, Any] | None = None,
+) -> Any:
+    """Read a configuration file, then apply `section.key=value` settings (values are YAML), then `options`.
 
-    Returns an instance of `cls`. Raises ConfigError on anything unknown or malformed.
+    `options` are values by their dotted keys, taken as they are. Returns an instance of `cls`. Raises ConfigError on
+    anything unknown or malformed.
     """
     tree = (read_yaml(path) or {}) if path else {}
-    where = str(path) if path else "the configuration"
+    where = str(path) if path else ""
     if not isinstance(tree, dict):
         raise ConfigError(f"{where} must be a mapping of sections, found {tree!r}")
     for setting in settings:
         dotted, equals, text = setting.partition("=")
         if not equals:
             raise ConfigError(f"--set needs section.key=value, found {setting!r}")
-        *sections, key = dotted.split(".")
-        node = tree
-        for section in sections:
-            node = node.setdefault(section, {})
-            if not isinstance(node, dict):
-                raise ConfigError(f"--set {setting!r}: {section!r} is a value, not a section")
         try:
-            node[key] = yaml.safe_load(text)
+            _set_value(tree, dotted, yaml.safe_load(text))
         except yaml.YAMLError as error:
             raise ConfigError(f"--set {setting!r} is not valid YAML") from error
+    for dotted, value in (options or {}).items():
+        _set_value(tree, dotted, value)
+    if path and (settings or options):
+        where = f"{where} with the options given"
     return parse_config(tree, cls, where)
+
+
+def _set_value(tree: dict, dotted: str, value: Any) -> None:
+    """Put `value` into nested dicts at `section.key`. Raises ConfigError where a section is a value."""
+    *sections, key = dotted.split(".")
+    for section in sections:
+        if tree.get(section) is None:
+            tree[section] = {}
+        tree = tree[section]
+        if not isinstance(tree, dict):
+            raise ConfigError(f"cannot set {dotted!r}: {section!r} is a value, not a section")
+    tree[key] = value
 
 
 def fingerprint(*parts: Any) -> str:

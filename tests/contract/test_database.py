@@ -160,7 +160,6 @@ def test_known_params_are_taken_as_they_are(tmp_path):
         (CameraConfig(model="PINHOLE", params="70,70,30,nan"), "expects 4 numbers"),
         (CameraConfig(model="PINHOLE", params="-70,70,30,20"), "focal length must be positive"),
         (CameraConfig(model="PINHOLE", params="70,70,300,20"), "principal point within 60 x 40 px"),
-        (CameraConfig(mode="folder"), "per-folder"),
     ],
 )
 def test_bad_camera_configurations_are_refused(tmp_path, config, message):

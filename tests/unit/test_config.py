@@ -2,10 +2,19 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Literal, get_args, get_origin, get_type_hints
 
 import pytest
 
-from hm_sfm.config import Config, KeypointConfig, NetworkConfig, fingerprint, load_config, parse_config
+from hm_sfm.config import (
+    RENAMED,
+    Config,
+    KeypointConfig,
+    NetworkConfig,
+    fingerprint,
+    load_config,
+    parse_config,
+)
 from hm_sfm.errors import ConfigError
 from hm_sfm.training.loop import TrainConfig
 
@@ -96,12 +105,80 @@ def test_negative_values_are_refused(setting):
         load_config(settings=(setting,))
 
 
+SECTIONS = {item.name: item.default_factory for item in dataclasses.fields(Config)}
+WORDS = [
+    (name, key, get_args(kind))
+    for name, section in SECTIONS.items()
+    for key, kind in get_type_hints(section).items()
+    if get_origin(kind) is Literal
+]
+
+
+def test_settings_that_are_one_of_a_few_words():
+    assert {f"{section}.{key}" for section, key, _ in WORDS} == {
+        "network.backbone", "network.coarse", "network.head", "matching.device", "matching.engine", "cameras.mode",
+        "mapping.mapper",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("section, key, allowed", WORDS)
+def test_a_word_that_is_not_allowed_is_refused_and_the_allowed_ones_named(section, key, allowed, tmp_path):
+    words = f"{', '.join(allowed[:-1])} or {allowed[-1]}"
+    sentence = f"{section}.{key} must be {words}, found 'heavy'"
+    path = write(tmp_path / "c.yaml", f"{section}: {{{key}: heavy}}")
+    for arguments in (
+        {"path": path},
+        {"settings": (f"{section}.{key}=heavy",)},
+        {"options": {f"{section}.{key}": "heavy"}},
+    ):
+        with pytest.raises(ConfigError, match=sentence):
+            load_config(**arguments)
+    with pytest.raises(ConfigError, match=f"c.yaml: {key} must be {words}, found False"):
+        parse_config({key: False}, SECTIONS[section], "c.yaml")
+    with pytest.raises(ConfigError, match=f"^{sentence}$"):
+        SECTIONS[section](**{key: "heavy"})
+    with pytest.raises(ConfigError, match=f"^{sentence}$"):
+        dataclasses.replace(SECTIONS[section](), **{key: "heavy"})
+    assert {
+        getattr(getattr(load_config(settings=(f"{section}.{key}={word}",)), section), key) for word in allowed
+    } == set(allowed)
+
+
+RENAMED_KEYS = [
+    (next(name for name, section in SECTIONS.items() if section is cls), old, new)
+    for cls, names in RENAMED.items()
+    for old, new in names.items()
+]
+
+
+@pytest.mark.parametrize("section, old, new", RENAMED_KEYS)
+def test_a_key_of_the_last_version_is_refused_and_the_new_one_named(section, old, new, tmp_path):
+    path = write(tmp_path / "old.yaml", f"{section}: {{{old}: 1}}")
+    with pytest.raises(ConfigError, match=f"old.yaml: the key '{section}.{old}' is now called {new}"):
+        load_config(path)
+    with pytest.raises(ConfigError, match=f"the key '{section}.{old}' is now called {new}"):
+        load_config(settings=(f"{section}.{old}=1",))
+    with pytest.raises(ConfigError, match=f"light.pt: the key '{old}' is now called {new}"):
+        parse_config({old: 1}, SECTIONS[section], "light.pt")
+    assert not hasattr(SECTIONS[section](), old)
+    for name in new.split(" or "):
+        section, key = name.split(" ")[0].split(".")
+        assert hasattr(getattr(Config(), section), key)
+
+
 def test_settings_come_on_top_of_the_file(tmp_path):
     path = write(tmp_path / "c.yaml", "pairs: {window: 7, loop_top: 3}")
     config = load_config(path, ("pairs.window=8", "matching.model=a=b.pt", "cameras.params='900,512,384'"))
     assert (config.pairs.window, config.pairs.loop_top) == (8, 3)
     assert config.matching.model == "a=b.pt"
     assert config.cameras.params == "900,512,384"
+    config = load_config(
+        path, ("pairs.window=8", "cameras.params=x"), options={"cameras.params": "9,5,3", "masks.folder": "1"}
+    )
+    assert (config.pairs.window, config.pairs.loop_top) == (8, 3)
+    assert (config.cameras.params, config.masks.folder) == ("9,5,3", "1")
+    empty = write(tmp_path / "empty.yaml", "pairs:\n")
+    assert load_config(empty, ("pairs.window=8",)).pairs.window == 8
 
 
 @pytest.mark.parametrize(
@@ -144,8 +221,10 @@ def test_parsing_a_written_out_configuration_gives_it_back():
 
 @pytest.mark.parametrize("name, value", leaves(Config()), ids=lambda part: part if isinstance(part, str) else "")
 def test_the_fingerprint_changes_with_any_value(name, value):
-    other = {str: "other", int: 4711, float: 0.4711, bool: not value}[type(value)]
     section, key = name.split(".")
+    other = {str: "other", int: 4711, float: 0.4711, bool: not value}[type(value)]
+    for words in (words for *names, words in WORDS if names == [section, key]):
+        other = words[-1]
     changed = dataclasses.replace(
         Config(), **{section: dataclasses.replace(getattr(Config(), section), **{key: other})}
     )

@@ -312,7 +312,7 @@ def run_export(options: argparse.Namespace) -> int:
 
 def run_compare(options: argparse.Namespace) -> int:
     from hm_sfm.evaluation.comparison import compare
-    from hm_sfm.evaluation.comparison_report import format_table, plot_tracks, require_plots, write_json
+    from hm_sfm.evaluation.comparison_report import format_table, plot_tracks, require_plots, write_comparison
 
     if (options.hloc_features is None) != (options.hloc_matches is None):
         raise InputError("--hloc-features and --hloc-matches need each other: hloc keeps one run in two files")
@@ -327,7 +327,7 @@ def run_compare(options: argparse.Namespace) -> int:
         hloc=(options.hloc_features, options.hloc_matches) if options.hloc_features else None,
         quiet=options.quiet,
     )
-    write_json(options.out / "compare.json", comparison)
+    write_comparison(options.out / "compare.json", comparison)
     plot_tracks(options.out / "compare.png", comparison)
     print(format_table(comparison))
     print(f"{options.out / 'compare.json'}, {options.out / 'compare.png'}; models: {options.out}/METHOD/sparse/0")

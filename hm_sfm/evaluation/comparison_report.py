@@ -1,7 +1,6 @@
-"""What a comparison looks like: a table for the terminal, OUT/compare.json, and the plots of OUT/compare.png."""
+"""A comparison for people to read: a table for the terminal, OUT/compare.json, and the plots of OUT/compare.png."""
 
 import dataclasses
-import json
 from importlib.metadata import version
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import numpy as np
 
 from hm_sfm.errors import MissingPackageError
 from hm_sfm.evaluation.comparison import AUC_SHOWN_DEG, Comparison, MethodResult
-from hm_sfm.io.atomic import replace_file
+from hm_sfm.io.atomic import replace_file, write_json
 
 STAGES = ("match", "keypoints", "verify", "map")
 LINE_STYLES = ("-", "--", ":", "-.")
@@ -28,7 +27,7 @@ def require_plots() -> None:
 
 
 def format_table(comparison: Comparison) -> str:
-    """The figures of all methods, one method a line, under a line of headings.
+    """The metrics of all methods, one method a line, under a line of headings.
 
     `matched` is the mean length of tracks as matched and verified, `track` and `median` are of the points, `per image`
     counts observations, `px` is the reprojection error.
@@ -66,13 +65,11 @@ def format_row(method: MethodResult) -> list[str]:
     return cells + ["-" if spent is None else f"{spent:.0f}" for spent in seconds]
 
 
-def write_json(path: Path, comparison: Comparison) -> None:
-    """Everything that a comparison holds, the methods by their names, and the version; atomic."""
-    figures = dataclasses.asdict(comparison)
-    figures["methods"] = {method.pop("name"): method for method in figures["methods"]}
-    figures["version"] = version("hm_sfm")
-    with replace_file(path) as temporary:
-        temporary.write_text(json.dumps(figures, indent=2) + "\n")
+def write_comparison(path: Path, comparison: Comparison) -> None:
+    """Write everything that a comparison holds, the methods by their names, and the version as JSON; atomic."""
+    content = dataclasses.asdict(comparison)
+    content["methods"] = {method.pop("name"): method for method in content["methods"]}
+    write_json(path, content | {"version": version("hm_sfm")})
 
 
 def plot_tracks(path: Path, comparison: Comparison) -> None:
@@ -88,11 +85,11 @@ def plot_tracks(path: Path, comparison: Comparison) -> None:
     counts, shares = figure.subplots(1, 2)
     for number, method in enumerate(comparison.methods):
         length, points = lay_out_histogram(method.track_length_histogram)
-        look = {"color": f"C{number % COLOURS}", "linestyle": LINE_STYLES[number // COLOURS % len(LINE_STYLES)]}
+        style = {"color": f"C{number % COLOURS}", "linestyle": LINE_STYLES[number // COLOURS % len(LINE_STYLES)]}
         label = f"{method.name} (mean {method.mean_track_length:.2f})"
-        counts.plot(length, np.where(points > 0, points, np.nan), marker="o", markersize=3, label=label, **look)
+        counts.plot(length, np.where(points > 0, points, np.nan), marker="o", markersize=3, label=label, **style)
         surviving = points[::-1].cumsum()[::-1]
-        shares.plot(length, 100 * surviving / max(1, surviving[0]), marker="o", markersize=3, **look)
+        shares.plot(length, 100 * surviving / max(1, surviving[0]), marker="o", markersize=3, **style)
     counts.set(title="Track lengths", xlabel="images that see a point", ylabel="points", yscale="log")
     shares.set(title="Survival", xlabel="n", ylabel="points seen in n images or more, %", ylim=(0, 102))
     for axes in (counts, shares):

@@ -1,5 +1,6 @@
 """Files and folders that appear whole or not at all."""
 
+import json
 import os
 import tempfile
 from collections.abc import Iterator
@@ -28,6 +29,12 @@ def replace_file(path: Path) -> Iterator[Path]:
         raise
     with suppress(OSError):  # not all file systems let a folder be flushed
         _flush(path.parent, os.O_RDONLY)
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write a JSON file for people to read, atomically."""
+    with replace_file(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n")
 
 
 @contextmanager

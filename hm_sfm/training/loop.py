@@ -53,7 +53,7 @@ class MultiviewSource:
     photos: str = ""
     """Folder of a folder of photos a scene."""
     tracks: str = ""
-    """Folder of <scene>/tracks.h5, made by pipelines/make_teacher_tracks.py."""
+    """Folder of <scene>/tracks.h5, made by pipelines/training/make_teacher_tracks.py."""
 
 
 @dataclass(frozen=True)

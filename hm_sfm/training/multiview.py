@@ -1,6 +1,6 @@
 """Training pairs of real photos: views of scenes that were reconstructed by teachers, supervised by their tracks.
 
-A scene is known by the tracks of its models only (pipelines/make_teacher_tracks.py): which point is seen where. Two
+A scene is known by the tracks of its models only (pipelines/training/make_teacher_tracks.py): which point is seen where. Two
 photos that share tracks are a pair, however far apart they are, whether a teacher matched them directly or not.
 """
 

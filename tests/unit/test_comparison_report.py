@@ -10,7 +10,13 @@ import pytest
 
 from hm_sfm.errors import MissingPackageError
 from hm_sfm.evaluation.comparison import Comparison, MethodResult
-from hm_sfm.evaluation.comparison_report import format_table, lay_out_histogram, plot_tracks, require_plots, write_json
+from hm_sfm.evaluation.comparison_report import (
+    format_table,
+    lay_out_histogram,
+    plot_tracks,
+    require_plots,
+    write_comparison,
+)
 
 GOOD = MethodResult(
     name="persistent",
@@ -69,16 +75,16 @@ def test_table_without_ground_truth_has_no_auc():
     assert len(row.split()) == 14
 
 
-def test_json_holds_every_figure_by_method(tmp_path):
-    write_json(tmp_path / "compare.json", make_comparison(GOOD, NOTHING))
-    figures = json.loads((tmp_path / "compare.json").read_text())
-    assert (figures["num_images"], figures["num_pairs"]) == (5, 10)
-    assert list(figures["methods"]) == ["persistent", "hloc"]
-    good = figures["methods"]["persistent"]
+def test_json_holds_all_metrics_by_method(tmp_path):
+    write_comparison(tmp_path / "compare.json", make_comparison(GOOD, NOTHING))
+    content = json.loads((tmp_path / "compare.json").read_text())
+    assert (content["num_images"], content["num_pairs"]) == (5, 10)
+    assert list(content["methods"]) == ["persistent", "hloc"]
+    good = content["methods"]["persistent"]
     assert good.keys() == {field.name for field in dataclasses.fields(MethodResult)} - {"name"}
     assert good["track_length_histogram"] == {"2": 534, "3": 400, "5": 300}
     assert good["auc_percent"] == {"0.25": 71.25, "0.5": 80.0, "1": 90.0, "3": 97.0}
-    assert figures["methods"]["hloc"]["seconds"]["match"] is None
+    assert content["methods"]["hloc"]["seconds"]["match"] is None
 
 
 def test_histogram_is_filled_with_zeros():

@@ -1,10 +1,11 @@
-"""How long are the tracks? The same photos by persistent keypoints, and by matches as LoFTR's users take them.
+"""Track lengths of the same photos with persistent keypoints, and with LoFTR-style matches.
 
-    python pipelines/compare_tracks.py PHOTOS OUT [GROUND_TRUTH]
+    python pipelines/examples/compare_tracks.py PHOTOS OUT [GROUND_TRUTH]
 
-Matches of two heads on the same features become keypoints in three ways: carried by homographies; the expectation
-head's points as they are; and its points snapped to 1 px, as hloc does it. Everything after that is the same. What
-`hm-sfm compare` does with more methods, to copy and change. GROUND_TRUTH holds <image name>.camera files.
+Matches of two heads on the same features become keypoints in three ways: propagated by homographies; the expectation
+head's points as they are; and its points snapped to 1 px, as hloc does it. Everything after that is the same.
+`hm-sfm compare` does this with more methods; this script is to copy and change. GROUND_TRUTH holds <image name>.camera
+files.
 """
 
 import sys
@@ -52,15 +53,15 @@ def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:
     # Three ways from matches to keypoints.
     camera_of = {image.name: cameras.cameras[index] for image, index in zip(images, cameras.camera_index)}
     verified = verify_pairs(images, pairs, homographies.read, camera_of, px_scale, checks)
-    budget = config.keypoints.max_keypoints
-    found = {
+    max_keypoints = config.keypoints.max_keypoints
+    keypoints_and_matches = {
         "persistent": persist_verified(images, verified, homographies, config),
-        "raw": make_keypoints(images, pairs, expectations.read, px_scale, None, budget),
-        "snapped": make_keypoints(images, pairs, expectations.read, px_scale, 1, budget),
+        "raw": make_keypoints(images, pairs, expectations.read, px_scale, None, max_keypoints),
+        "snapped": make_keypoints(images, pairs, expectations.read, px_scale, 1, max_keypoints),
     }
 
     # The same verification and mapping for all, and what became of the tracks.
-    for name, (keypoints, matches) in found.items():
+    for name, (keypoints, matches) in keypoints_and_matches.items():
         (out / name).mkdir(exist_ok=True)
         database = out / name / "database.db"
         write_database(database, images, cameras, keypoints, matches)

@@ -1,30 +1,31 @@
 """Write docs/api.md, the reference of the Python API, from the docstrings.
 
-python pipelines/make_api_reference.py
+python docs/make_api_reference.py
 """
 
 import ast
 import inspect
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import hm_sfm
 
 ROOT = Path(__file__).parents[1]
 TARGET = ROOT / "docs" / "api.md"
-MODULES = (
-    "types", "coordinates", "config", "errors", "images", "masks", "frames", "pairs", "network.model", "matching",
-    "verification", "keypoints", "tracks", "database", "mapping", "reconstruction", "diagnosis", "evaluation", "hloc",
-    "conversion", "coarse_matches", "refinement", "variants", "sharpening", "rigs", "bitmaps", "snapshots",
+FIRST = ("types", "config", "errors")
+PACKAGES = (
+    "geometry", "photos", "pairs", "matching", "keypoints", "colmap", "pipeline", "report", "formats", "export",
+    "evaluation",
 )  # fmt: skip
-"""In the order in which they are worth reading: the types first, then the stages, then what goes with them."""
+"""In the order in which they are worth reading: the way of the data."""
 HEADER = """# Python API
 
-Made from the docstrings by `python pipelines/make_api_reference.py`; a test checks that it is up to date.
+Made from the docstrings by `python docs/make_api_reference.py`.
 
 All coordinates are px in COLMAP's frame: the centre of the top-left pixel is (0.5, 0.5). Where images are concerned,
 they are those of the stored photo, unrotated and in full size. Examples are in the [README](../README.md#python) and in
-[pipelines/](../pipelines).
+[pipelines/examples/](../pipelines/examples).
 """
 
 Definition = ast.FunctionDef | ast.ClassDef
@@ -32,20 +33,36 @@ Definition = ast.FunctionDef | ast.ClassDef
 
 def make_reference() -> str:
     """The whole page."""
-    public = [f"| `{name}` | [hm_sfm.{module}](#{anchor(module)}) |" for name, module in hm_sfm._MODULE_OF.items()]
+    public = [f"| `{name}` | [{module}](#{anchor(module)}) |" for name, module in find_public_names()]
     parts = [HEADER, "## hm_sfm\n", "| `from hm_sfm import` | defined in |\n|---|---|", *public]
-    return "\n".join([*parts, *map(describe_module, MODULES)])
+    return "\n".join([*parts, *map(describe_module, list_modules())])
+
+
+def find_public_names() -> Iterator[tuple[str, str]]:
+    """The names that `hm_sfm` exports, each with the module that defines it."""
+    for name in sorted(hm_sfm.__all__):
+        yield name, getattr(hm_sfm, name).__module__
+
+
+def list_modules() -> list[Path]:
+    """The files to describe: the modules that come first, then package by package."""
+    root = ROOT / "hm_sfm"
+    modules = [root / f"{name}.py" for name in FIRST]
+    for package in PACKAGES:
+        modules += sorted(path for path in (root / package).rglob("*.py") if path.name != "__init__.py")
+    return modules
 
 
 def anchor(module: str) -> str:
     """What GitHub makes of a module's heading."""
-    return f"hm_sfm{module.replace('.', '')}"
+    return module.replace(".", "")
 
 
-def describe_module(module: str) -> str:
+def describe_module(path: Path) -> str:
     """Its docstring, then its public functions and classes in the order of the file."""
-    tree = ast.parse((ROOT / "hm_sfm" / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8"))
-    parts = [f"\n## hm_sfm.{module}\n", *describe(tree)]
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    parts = [f"\n## {name}\n", *describe(tree)]
     for node in list_public(tree):
         parts += [f"### {node.name}\n", f"```python\n{write_signature(node)}\n```\n", *describe(node)]
         if isinstance(node, ast.ClassDef):

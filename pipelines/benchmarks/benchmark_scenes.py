@@ -1,14 +1,14 @@
 """Models of folders of photos: hm_sfm against ALIKED + LightGlue, XFeat* and COLMAP's SIFT.
 
-    peers/bin/python pipelines/benchmark_scenes.py SCENES/fox SCENES/front --out out/scenes --references teachers
+    peers/bin/python pipelines/benchmarks/benchmark_scenes.py SCENES/fox SCENES/front --out out --references teachers
 
-The environment `peers` is described in pipelines/peers.py. Nothing is known about the cameras. All methods match all
-pairs and go through the same cameras, verification and mapper; hm_sfm's patches are verified a first time before they
-carry keypoints. --references holds a COLMAP model a scene (pipelines/make_teacher_tracks.py leaves them): a verified
-pair counts as correct where its inliers give the relative pose that the reference has.
+peers.py describes the environment `peers`. Nothing is known about the cameras. All methods match all pairs and use the
+same cameras, verification and mapper; hm_sfm also verifies its patches before they propagate keypoints. --references
+holds one COLMAP model per scene, as pipelines/training/make_teacher_tracks.py writes them: a verified pair is correct
+where its inliers give the relative pose that the reference has.
 
-Each scene and method is stored in OUT as it is done: an interrupted benchmark goes on from there. Other weights,
-settings or photos are measured anew; after a change of code, take a new OUT.
+The result of each scene and method is stored in OUT: an interrupted benchmark goes on from there. Other weights,
+settings or photos are measured again; after a change of code, take a new OUT.
 """
 
 import argparse
@@ -20,15 +20,16 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import pycolmap
-from peers import AlikedLightGlue, Found, XfeatStar, load_package, match_sift, match_snapped, match_sparse
+from peers import AlikedLightGlue, IndexedMatches, XfeatStar, load_package, match_sift, match_snapped, match_sparse
 from scene_scores import SceneScore, count_held, count_verified, judge_pairs, read_reference, tabulate
-from tables import format_table, write_json
+from tables import format_table
 
 from hm_sfm.colmap.database import make_cameras, write_database
 from hm_sfm.colmap.mapping import map_incrementally, summarise_models
 from hm_sfm.colmap.verification import verify_database
 from hm_sfm.config import Config, PairConfig, fingerprint, load_config
 from hm_sfm.errors import HmSfmError, InputError, NoModelError
+from hm_sfm.io.atomic import write_json
 from hm_sfm.matching.store import digest_image
 from hm_sfm.pairs.selection import select_pairs
 from hm_sfm.photos.images import list_images
@@ -73,9 +74,9 @@ def measure_scene(
         started = time.monotonic()
         result = build_model(folder, images, method, run, config)
         seconds = time.monotonic() - started
-        figures = (result.points, result.mean_track_length, result.mean_reprojection_px)
+        metrics = (result.points, result.mean_track_length, result.mean_reprojection_px)
         verified = count_verified(run / "database.db")
-        score = SceneScore(name, method, len(images), result.registered, verified, None, None, *figures, seconds)
+        score = SceneScore(name, method, len(images), result.registered, verified, None, None, *metrics, seconds)
     if reference is not None and score.judged is None:
         max_error_px = config.verification.max_error_px * max(measure_px_scales(images, config).values())
         judged, correct = judge_pairs(run / "database.db", reference, max_error_px)
@@ -100,7 +101,7 @@ def build_model(folder: Path, images: Sequence[ImageRef], method: str, run: Path
     return summarise_models(map_incrementally(database, folder, run / "sparse", config.mapping, False), len(images))
 
 
-def match_peer(folder: Path, images: Sequence[ImageRef], method: str, config: Config) -> Found:
+def match_peer(folder: Path, images: Sequence[ImageRef], method: str, config: Config) -> IndexedMatches:
     """All pairs of the photos, by a peer."""
     pairs = select_pairs([image.name for image in images], config.pairs)
     if method == "aliked_lightglue":

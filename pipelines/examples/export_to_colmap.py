@@ -1,6 +1,6 @@
 """Matches of hm_sfm for a COLMAP workflow: a folder of photos -> a verified COLMAP database, mapped by COLMAP itself.
 
-    python pipelines/export_to_colmap.py PHOTOS OUT
+    python pipelines/examples/export_to_colmap.py PHOTOS OUT
 
 OUT/database.db opens in COLMAP's GUI; `colmap mapper --database_path OUT/database.db --image_path PHOTOS
 --output_path OUT/colmap` does the same as the last stage here, with COLMAP's own defaults.

@@ -1,6 +1,6 @@
 """A folder of photos -> a COLMAP model, one call a stage: what `hm-sfm reconstruct` does, to copy and change.
 
-    python pipelines/reconstruct_folder.py PHOTOS OUT
+    python pipelines/examples/reconstruct_folder.py PHOTOS OUT
 
 Writes OUT/matches.h5, OUT/database.db and OUT/sparse. Started again, it keeps the matches that are there.
 """
@@ -23,7 +23,7 @@ def reconstruct_folder(photos: Path, out: Path) -> None:
     checks = config.verification
     claim_folder(out)
 
-    # What there is, and which images to match with which.
+    # The images, and which of them to match with which.
     images = list_images(photos).images
     pairs = choose_pairs(images, out, config)
     cameras = make_cameras(images, config.cameras)
@@ -33,7 +33,7 @@ def reconstruct_folder(photos: Path, out: Path) -> None:
     store = open_store(out / "matches.h5", images, config)
     match_pairs(images, pairs, matcher, store)
 
-    # Only matches that agree with the two-view geometry of their pair may carry keypoints.
+    # Only matches that agree with the two-view geometry of their pair may propagate keypoints.
     camera_of = {image.name: cameras.cameras[index] for image, index in zip(images, cameras.camera_index)}
     px_scale = measure_px_scales(images, config)
     verified = verify_pairs(images, pairs, store.read, camera_of, px_scale, checks)

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tables import write_json
 from torch import Tensor
 
 from hm_sfm.config import ImageConfig, MatchingConfig, fingerprint
 from hm_sfm.evaluation.relative_poses import PosePair, read_strecha_pairs, score_poses
-from hm_sfm.io.atomic import replace_file
+from hm_sfm.io.atomic import replace_file, write_json
 from hm_sfm.matching.matcher import FINE_CHUNK, HomoMatcher, HomoNet, autocast, pad_image, read_checkpoint
 from hm_sfm.network.fine import make_fine_map
 from hm_sfm.photos.images import prepare_image, read_ref
@@ -107,13 +106,15 @@ def score_cells(net: HomoNet, trial: Trial) -> Scores:
 
 
 def score_net(net: HomoNet, trial: Trial) -> Scores:
-    """All figures of a network: CELLS, and what score_matches measures."""
+    """All metrics of a network: CELLS, and what score_matches measures."""
     return score_cells(net, trial) | score_matches(net, trial)
 
 
 def score_matches(net: HomoNet, trial: Trial) -> Scores:
-    """Figures of a network's matches: `PCK` of the points that its patches cover, `centre` of the patches' centres
-    alone, `AUC@5` of poses, all in percent, and `ms` of its stages.
+    """Metrics of a network's matches.
+
+    `PCK` of the points that its patches cover, `centre` of the patches' centres alone and `AUC@5` of poses, all in
+    percent, and `ms` of its stages.
     """
     matcher, scores = make_matcher(net, trial.config), {}
     errors = [measure_matches(matcher, pair) for pair in trial.known]
@@ -125,8 +126,10 @@ def score_matches(net: HomoNet, trial: Trial) -> Scores:
 
 
 def measure_matches(matcher: HomoMatcher, pair: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Errors, px, of the matches of a pair with known surfaces: of the pixels within r_e of a patch's centre, (N,), and
-    of the centres, (M,). What view B does not show is left out; a wrong coarse match counts by all its points.
+    """Errors, px, of the matches of a pair with known surfaces.
+
+    Returns those of the pixels within r_e of a patch's centre (N,), and those of the centres (M,). Points that view B
+    does not show are left out; all points of a wrong coarse match count.
     """
     height, width = pair["surface"].shape
 
@@ -144,8 +147,10 @@ def measure_matches(matcher: HomoMatcher, pair: dict[str, np.ndarray]) -> tuple[
 
 
 def time_stages(matcher: HomoMatcher, pair: PosePair) -> Scores:
-    """Milliseconds of the coarse stage of a pair of photos, and of the fine stage for TIMED_PATCHES patches, in chunks
-    as they are matched. The backbone, which runs once an image, counts in neither.
+    """Milliseconds of the coarse stage of a pair of photos, and of the fine stage for TIMED_PATCHES patches.
+
+    The patches are processed in chunks, as in matching. The time of the backbone, which runs once per image, is in
+    neither.
     """
     net, device = matcher.net, matcher.device
     backbone, head = net.backbone, net.head
@@ -211,16 +216,19 @@ Made by
 
     {command}
 
-Each hypothesis of the fine stage: {config.steps} steps of {config.pairs_per_step} pairs of {config.size_px} px, with the
-features of `{Path(config.start_from).name}`, which go on learning, and a head that starts new. The first table is of
-w/r/K = {net.window}/{net.radius}/{net.iterations}; in the second, homographies are supervised as in the last row of the first, and `expectation` is
-LoFTR's head, which has a centre only to supervise. With spacing 2 every second cell of a patch is looked up each way, a
-quarter of them, and the layers are wider.
+Each version of the fine stage is trained for {config.steps} steps of {config.pairs_per_step} pairs of
+{config.size_px} px. It starts from the features of `{Path(config.start_from).name}`, which go on learning, and a
+new head. The first table is of w/r/K = {net.window}/{net.radius}/{net.iterations}. In the second, homographies are
+supervised as in the last row of the first; `expectation` is LoFTR's head, of which only the centre can be
+supervised. With spacing 2 every second cell of a patch is looked up along each axis, a quarter of them, and the layers
+are wider.
 
-- `recall` and `precision`, in percent: of the true coarse matches, those found, and of the answers to them, those right
-  to within a cell. {PAIRS} pairs of {SIZE_WH[0]} x {SIZE_WH[1]} px, made of photos held out from training{real}.
-- `PCK@1` and `PCK@3`: visible points of the matched patches that are within 1 and 3 px of the truth, in percent, on the
-  same pairs; a wrong coarse match counts by all its points. `centre`: the centres of the patches alone.
+- `recall` and `precision`, in percent: the share of the true coarse matches that are matched, and the share of these
+  that are right to within a cell. {PAIRS} pairs of {SIZE_WH[0]} x {SIZE_WH[1]} px, made of photos held out from
+  training{real}.
+- `PCK@1` and `PCK@3`: visible points of the matched patches that are within 1 and 3 px of the ground truth, in
+  percent, on the same pairs; all points of a wrong coarse match count. `centre`: the centres of the patches
+  alone.
 - `AUC@5`: of relative poses on all pairs of {scene.name}, at 5 degrees, in percent; OpenCV's RANSAC, as in LoFTR.
 - `fine ms`: of {TIMED_PATCHES} patches; `coarse ms`: of a pair of {scene.name}. Medians of {TIMED_CALLS} calls,
   {torch.get_num_threads()} threads, PyTorch {torch.__version__}, device {config.device}.

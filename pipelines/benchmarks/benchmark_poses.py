@@ -1,10 +1,10 @@
 """Relative poses from single pairs of scenes whose cameras are known: hm_sfm against XFeat* and ALIKED + LightGlue.
 
-    peers/bin/python pipelines/benchmark_poses.py fountain-P11 Herz-Jesus-P8 --json poses.json
+    peers/bin/python pipelines/benchmarks/benchmark_poses.py fountain-P11 Herz-Jesus-P8 --json poses.json
 
-The environment `peers` is described in pipelines/peers.py. SCENE has the layout of Strecha's data sets: images/,
-gt_dense_cameras/ and K.txt. All pairs of a scene are matched at the same long edge by all methods, and their essential
-matrices estimated by the same two RANSACs: OpenCV's, as LoFTR does, and COLMAP's LO-RANSAC.
+peers.py describes the environment `peers`. SCENE has the layout of Strecha's data sets: images/, gt_dense_cameras/ and
+K.txt. All methods match all pairs of a scene at the same long edge. The essential matrices are estimated by the same
+two RANSACs: OpenCV's, as LoFTR does, and COLMAP's LO-RANSAC.
 """
 
 import argparse
@@ -13,22 +13,23 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from peers import AlikedLightGlue, HmSfm, HmSfmAll, Matcher, XfeatStar
-from tables import format_table, write_json
+from tables import format_table
 
 from hm_sfm.config import Config, load_config
 from hm_sfm.errors import HmSfmError
 from hm_sfm.evaluation.relative_poses import PosePair, read_strecha_pairs, score_pose_matches
+from hm_sfm.io.atomic import write_json
 
 METHODS = {
     "hm_sfm": HmSfm,
-    "hm_sfm_all": HmSfmAll,  # the matches below the score that a reconstruction asks for, too
+    "hm_sfm_all": HmSfmAll,  # with the matches below the score that a reconstruction asks for
     "aliked_lightglue": AlikedLightGlue,
     "xfeat_star": XfeatStar,
 }
 
 
 def benchmark_poses(scenes: Sequence[Path], methods: Sequence[str], config: Config) -> list[dict[str, object]]:
-    """A row a scene and method. Raises InputError on an unusable scene and where a peer is not installed."""
+    """One row per scene and method. Raises InputError on an unusable scene and where a peer is not installed."""
     pairs_of = {scene: read_strecha_pairs(scene) for scene in scenes}
     matchers = {method: METHODS[method](config) for method in methods}
     rows = []
@@ -40,7 +41,7 @@ def benchmark_poses(scenes: Sequence[Path], methods: Sequence[str], config: Conf
 
 
 def score_method(matcher: Matcher, pairs: Sequence[PosePair]) -> dict[str, float]:
-    """AUC in percent by RANSAC and threshold, matches and seconds per pair; a photo's features count once."""
+    """AUC in percent by RANSAC and threshold, matches and seconds per pair; each photo is encoded once."""
     before = matcher.seconds
     scores = score_pose_matches(matcher.match, pairs)
     names = {name: name.replace("_auc_", "@").removesuffix("deg") for name in scores if "_auc_" in name}

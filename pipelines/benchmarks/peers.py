@@ -92,8 +92,8 @@ class AlikedLightGlue(Matcher):
 
     def encode(self, path: Path):
         photo = read_photo(path, self.config.images.long_edge_px)
-        found = self.lightglue.describe(photo)
-        return found, to_stored(to_px(found["keypoints"][0]), photo.stored_from_scaled)
+        features = self.lightglue.describe(photo)
+        return features, to_stored(to_px(features["keypoints"][0]), photo.stored_from_scaled)
 
     def match_indices(self, features0, features1) -> np.ndarray:
         """(M, 2) int64: keypoint of photo 0, keypoint of photo 1; one to one."""
@@ -143,11 +143,11 @@ def to_stored(xy_px: np.ndarray, stored_from_scaled: np.ndarray) -> np.ndarray:
     return xy_px @ stored_from_scaled[:2, :2].T + stored_from_scaled[:2, 2]
 
 
-Found = tuple[list[Keypoints], list[IndexMatches]]
+IndexedMatches = tuple[list[Keypoints], list[IndexMatches]]
 """The keypoints of each photo, in the order of the photos, and the matches of all pairs."""
 
 
-def match_sparse(matcher: AlikedLightGlue, images: Sequence[ImageRef], pairs: Sequence[ImagePair]) -> Found:
+def match_sparse(matcher: AlikedLightGlue, images: Sequence[ImageRef], pairs: Sequence[ImagePair]) -> IndexedMatches:
     """Keypoints and matches of the pairs, as they are."""
     path_of = {image.name: image.path for image in images}
     matches = []
@@ -159,17 +159,17 @@ def match_sparse(matcher: AlikedLightGlue, images: Sequence[ImageRef], pairs: Se
     return keypoints, matches
 
 
-def match_snapped(matcher: XfeatStar, images: Sequence[ImageRef], pairs: Sequence[ImagePair]) -> Found:
+def match_snapped(matcher: XfeatStar, images: Sequence[ImageRef], pairs: Sequence[ImagePair]) -> IndexedMatches:
     """Semi-dense matches of the pairs, whose points differ from pair to pair, snapped to a grid so that tracks form."""
     path_of = {image.name: image.path for image in images}
-    found = {
+    matches_of = {
         pair: matcher.match(path_of[pair.name0], path_of[pair.name1])
         for pair in tqdm(pairs, desc="matches", unit="pair")
     }
-    return snap([image.name for image in images], found, SNAP_PX)
+    return snap([image.name for image in images], matches_of, SNAP_PX)
 
 
-def match_sift(folder: Path, images: Sequence[ImageRef]) -> Found:
+def match_sift(folder: Path, images: Sequence[ImageRef]) -> IndexedMatches:
     """COLMAP's SIFT with its defaults, all pairs; not verified."""
     with tempfile.TemporaryDirectory() as temporary:
         path = Path(temporary) / "sift.db"
@@ -186,16 +186,16 @@ def match_sift(folder: Path, images: Sequence[ImageRef]) -> Found:
     return [make_keypoints(image.name, xy[image.name]) for image in images], matches
 
 
-def snap(names: Sequence[str], found: Mapping[ImagePair, PointMatches], cell_px: float) -> Found:
+def snap(names: Sequence[str], matches_of: Mapping[ImagePair, PointMatches], cell_px: float) -> IndexedMatches:
     """Move points to the nearest point of a grid of `cell_px`, as hloc does with semi-dense matches.
 
     Where several matches of a pair then share a keypoint, the first one stays.
     """
     parts = {name: [] for name in names}
-    for pair, matches in found.items():
+    for pair, matches in matches_of.items():
         for side, name, xy in ((0, pair.name0, matches.xy0), (1, pair.name1, matches.xy1)):
             parts[name].append((pair, side, np.rint(xy / cell_px).astype(np.int64)))
-    indices = {pair: np.zeros((len(matches), 2), np.int64) for pair, matches in found.items()}
+    indices = {pair: np.zeros((len(matches), 2), np.int64) for pair, matches in matches_of.items()}
     keypoints = []
     for name in names:
         cells = np.concatenate([np.zeros((0, 2), np.int64), *(cell for _, _, cell in parts[name])])

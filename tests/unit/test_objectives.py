@@ -1,4 +1,4 @@
-"""What pipelines/ablate.py varies of the supervision: points of a patch, and coarse matches that are one cell off."""
+"""What `supervise` changes of the fine stage: points of a patch, and coarse matches that are one cell off."""
 
 import csv
 import dataclasses

@@ -1,6 +1,6 @@
 """Structure from motion in the steps of hloc, with its files between them: pairs, features, matches, reconstruction.
 
-    python pipelines/hloc_style_steps.py PHOTOS OUT
+    python pipelines/examples/hloc_style_steps.py PHOTOS OUT
 
 After step 3, hloc itself can take over, with the files that are in OUT/hloc by then:
 

@@ -1,18 +1,20 @@
 """The paper's three ablations: what supervises the fine stage, its w/r/K, and the coarse transformer.
 
-    python pipelines/ablate.py configs/train_ablations.yaml --scene SCENE --attention-weights FILE
+    python pipelines/training/ablate.py configs/train_ablations.yaml --scene SCENE --attention-weights FILE
 
-Every variant of the fine stage starts from the same features with a new head, for the same few steps. FILE holds a trained
-coarse transformer: its network is judged with it, and without it by mutual nearest neighbours of the plain features;
-without FILE there is no third table. SCENE has the layout of Strecha's data sets: images/, gt_dense_cameras/ and K.txt.
+Each version of the fine stage starts from the same features with a new head and trains for the same few steps. FILE
+holds a network with a trained coarse transformer: it is scored with the transformer, and without it by mutual nearest
+neighbours of the plain features; without FILE there is no third table. SCENE has the layout of Strecha's data sets:
+images/, gt_dense_cameras/ and K.txt.
 
-Variants lie in folders of their own below the configuration's `out`: an interrupted run goes on from there, and what is
-done is not done again. After a change of code, photos, scene or weights, take a new `out`.
+Each version has a folder of its own below the configuration's `out`: an interrupted run goes on from there and repeats
+nothing. After a change of code, photos, scene or weights, take a new `out`.
 """
 
 import argparse
 import shlex
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +32,6 @@ from ablation_scores import (
     score_net,
     score_once,
 )  # fmt: skip
-from tables import format_markdown
 
 from hm_sfm.config import load_config
 from hm_sfm.errors import ConfigError, HmSfmError
@@ -49,13 +50,13 @@ def ablate(config: TrainConfig, scene: Path, attention_weights: Path | None) -> 
     trial = prepare_trial(config, scene)
     coarse = score_coarse(attention_weights, trial) if attention_weights else {}
     config = replace(config, start_from=str(drop_head(Path(config.start_from), Path(config.out) / "features.pt")))
-    losses = {row: score_variant(replace(config, supervise=name), trial) for row, name in SUPERVISIONS.items()}
+    losses = {row: score_version(replace(config, supervise=name), trial) for row, name in SUPERVISIONS.items()}
     # LoFTR's head, trained as LoFTR does: a point has no homography to supervise.
     expectation = replace(config, network=replace(config.network, head="expectation"), supervise="centre")
-    sizes = {"expectation": score_variant(expectation, trial)}
+    sizes = {"expectation": score_version(expectation, trial)}
     for w, r, k, spacing in SIZES:
         network = replace(config.network, window=w, radius=r, iterations=k, spacing=spacing)
-        sizes[f"{w}/{r}/{k}" + f", spacing {spacing}" * (spacing > 1)] = score_variant(
+        sizes[f"{w}/{r}/{k}" + f", spacing {spacing}" * (spacing > 1)] = score_version(
             replace(config, network=network), trial
         )
     tables = {
@@ -66,8 +67,8 @@ def ablate(config: TrainConfig, scene: Path, attention_weights: Path | None) -> 
     return "".join(f"\n## {title}\n\n{table}\n" for title, table in tables.items() if table)
 
 
-def score_variant(config: TrainConfig, trial: Trial) -> Scores:
-    """Train a variant of the fine stage, or what is left of it, and score it."""
+def score_version(config: TrainConfig, trial: Trial) -> Scores:
+    """Train a version of the fine stage, or finish an interrupted training, and score it."""
     net = config.network
     size = "-".join(map(str, (net.window, net.radius, net.iterations, net.spacing)))
     config = replace(config, out=str(Path(config.out) / f"{net.head}-{size}-{config.supervise}"))
@@ -84,6 +85,16 @@ def score_coarse(weights: Path, trial: Trial) -> dict[str, Scores]:
     folder = Path(trial.config.out) / f"coarse-{digest_weights(str(weights))[:8]}"
     nets = {"with": net, "without": drop_transformer(net)}
     return {row: score_once(folder / f"{row}-{trial.key}.json", partial(score_net, nets[row], trial)) for row in nets}
+
+
+def format_markdown(rows: Mapping[str, Mapping[str, float]], columns: Sequence[str]) -> str:
+    """Scores by row and column as a table of Markdown, with one digit; columns that no row has are left out."""
+    known = [name for name in columns if any(name in scores for scores in rows.values())]
+    cells = [["", *known], *([row, *(f"{scores[name]:.1f}" for name in known)] for row, scores in rows.items())]
+    widths = [max(3, *map(len, column)) for column in zip(*cells)]
+    cells.insert(1, ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])])
+    lines = ([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])] for line in cells)
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def main() -> None:

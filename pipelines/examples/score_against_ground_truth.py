@@ -1,6 +1,6 @@
 """Reconstruct a scene whose cameras are known, and print how good the model is.
 
-    python pipelines/score_against_ground_truth.py SCENE OUT
+    python pipelines/examples/score_against_ground_truth.py SCENE OUT
 
 SCENE has the layout of Strecha's data sets: images/, gt_dense_cameras/<image name>.camera, and K.txt, the 3 x 3 matrix
 of intrinsics of the files in images/, in COLMAP's frame. With K.txt the intrinsics are known and kept; without it they
@@ -22,23 +22,22 @@ AUC_SHOWN_DEG = (0.25, 0.5, 1, 3, 5)
 
 
 def score_against_ground_truth(scene: Path, out: Path) -> None:
-    truth = read_strecha_cameras(scene / "gt_dense_cameras")
+    ground_truth = read_strecha_cameras(scene / "gt_dense_cameras")
     cameras = read_intrinsics(scene / "K.txt") if (scene / "K.txt").exists() else CameraConfig()
 
     started = time.monotonic()
     result = reconstruct(scene / "images", out, Config(cameras=cameras))
     seconds = time.monotonic() - started
 
-    score = score_model(result.models[0], truth)
+    score = score_model(result.models[0], ground_truth)
     auc = [score.auc_percent[limit] for limit in AUC_SHOWN_DEG]
     print(f"registered          {score.registered} of {score.num_images}")
     print(f"AUC at degrees      {' / '.join(f'{limit:5}' for limit in AUC_SHOWN_DEG)}")
     print(f"    of pose errors  {' / '.join(f'{value:5.1f}' for value in auc)} %")
     print(f"median rotation     {score.median_rotation_deg:.3f} deg")
     print(f"median translation  {score.median_translation_deg:.3f} deg")
-    print(
-        f"camera positions    {100 * measure_position_error(result.models[0], truth):.3f} % of the scene's extent off"
-    )
+    position_percent = 100 * measure_position_error(result.models[0], ground_truth)
+    print(f"camera positions    {position_percent:.3f} % of the scene's extent off")
     print(f"points              {result.points}")
     print(f"mean track length   {result.mean_track_length:.2f} images")
     print(f"mean reprojection   {result.mean_reprojection_px:.3f} px")

@@ -27,7 +27,7 @@ CROPS_PER_PHOTO = 40
 
 
 def measure_in_process(job: Mapping[str, Any]) -> dict[str, object] | None:
-    """A row of figures, or None where the method's package is not installed. Raises InputError with what went wrong.
+    """A row of metrics, or None where the method's package is not installed. Raises InputError with what went wrong.
 
     job: arguments of measure_method or measure_folder, JSON values and paths.
     """
@@ -94,16 +94,16 @@ def time_hm_sfm(_: str, images: Sequence[Any], config: Config) -> tuple[dict[str
     matcher.net.coarse.match = time_call(seconds, "coarse", matcher.net.coarse.match)
     matcher.net.head.forward = time_call(seconds, "fine", matcher.net.head.forward)
     match = time_call(seconds, "rest", matcher.match_features)
-    found = [
+    matches = [
         PairMatches(pair=ImagePair.of(a, b), **vars(match(features[a], features[b])))
         for a, b in combinations(sorted(features), 2)
     ]
     seconds["rest"] -= seconds["coarse"] + seconds["fine"]
     with tempfile.TemporaryDirectory() as folder:
         store = open_store(Path(folder) / "matches.h5", images, config)
-        time_call(seconds, "store", store.write)(found)
+        time_call(seconds, "store", store.write)(matches)
         time_call(seconds, "store", store.merge)()
-    return dict(seconds), sum(map(len, found))
+    return dict(seconds), sum(map(len, matches))
 
 
 def time_peer(method: str, images: Sequence[Any], config: Config) -> tuple[dict[str, float], int]:
@@ -118,8 +118,8 @@ def time_peer(method: str, images: Sequence[Any], config: Config) -> tuple[dict[
         matcher.match_features(first, first)
         features = [time_call(seconds, "encode", matcher.encode)(image.path) for image in images]
         match = time_call(seconds, "rest", matcher.match_features)
-        found = [len(match(a, b)[0]) for a, b in combinations(features, 2)]
-    return dict(seconds), sum(found)
+        counts = [len(match(a, b)[0]) for a, b in combinations(features, 2)]
+    return dict(seconds), sum(counts)
 
 
 def time_sift(_: str, images: Sequence[Any], config: Config) -> tuple[dict[str, float], int]:

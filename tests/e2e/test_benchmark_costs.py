@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-PIPELINES = Path(__file__).parents[2] / "pipelines"
+BENCHMARKS = Path(__file__).parents[2] / "pipelines" / "benchmarks"
 
 
 @pytest.fixture
 def load(monkeypatch):
-    """Import a module of pipelines/, which is no package: its scripts find each other by their folder."""
-    monkeypatch.syspath_prepend(PIPELINES)
+    """Import a module of pipelines/benchmarks/, which is no package: its scripts find each other by their folder."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
     return importlib.import_module
 
 
@@ -22,16 +22,12 @@ def run_benchmark(load, monkeypatch, capfd):
     """Run the benchmark with its arguments and return what it printed on stdout and stderr."""
 
     def run_here(*arguments: object) -> tuple[str, str]:
-        monkeypatch.setattr(sys, "argv", ["benchmark.py", *map(str, arguments)])
+        monkeypatch.setattr(sys, "argv", ["benchmark_costs.py", *map(str, arguments)])
         capfd.readouterr()
-        load("benchmark").main()
+        load("benchmark_costs").main()
         return capfd.readouterr()
 
     return run_here
-
-
-def test_the_recipe_is_short():
-    assert len((PIPELINES / "benchmark.py").read_text().splitlines()) < 100
 
 
 def test_costs_by_stage(scene, tmp_path, run_benchmark):
@@ -64,7 +60,7 @@ def test_what_goes_wrong_is_one_sentence(tmp_path, run_benchmark, capfd):
     assert capfd.readouterr().err.splitlines()[-1].endswith(f"the image folder {tmp_path / 'none'} does not exist")
 
 
-def test_scaling_leaves_figures_and_a_curve(scene, tmp_path, run_benchmark):
+def test_scaling_leaves_rows_and_a_curve(scene, tmp_path, run_benchmark):
     printed, _ = run_benchmark(scene.images, "--scaling", 2, "--out", tmp_path / "out")
     (row,) = json.loads((tmp_path / "out" / "scaling.json").read_text())
     assert (row["images"], row["pairs"], row["percent_of_pairs"]) == (2, 1, 100)
@@ -74,7 +70,7 @@ def test_scaling_leaves_figures_and_a_curve(scene, tmp_path, run_benchmark):
 
 
 def test_scaling_doubles_the_images(scene, tmp_path, load, monkeypatch):
-    benchmark = load("benchmark")
+    benchmark = load("benchmark_costs")
     monkeypatch.setattr(benchmark, "write_crops", lambda *_: None)
     monkeypatch.setattr(benchmark, "draw_scaling", lambda *_: None)
     monkeypatch.setattr(benchmark, "measure_in_process", lambda job: {"photos": str(job["photos"])})

@@ -1,11 +1,11 @@
-"""How many of the truly overlapping pairs does retrieval find? Measured against sparse models of the scenes.
+"""How many of the truly overlapping pairs retrieval finds, measured against sparse models of the scenes.
 
-    python pipelines/benchmark_retrieval.py PHOTOS [PHOTOS ...] --models MODELS --out OUT
+    python pipelines/benchmarks/benchmark_retrieval.py PHOTOS [PHOTOS ...] --models MODELS --out OUT
 
-MODELS/<scene>/sparse holds the COLMAP models of a scene, made from all its pairs, where <scene> is the name of the
-folder of its photos. Two images overlap where they share enough points. Each scene is searched by itself, and with the
-photos of all scenes mixed, where its own must be told from those of the others. `true` counts the overlapping pairs;
-`recall` says how many of them were found, and `pairs` how many of all possible pairs were taken, in per cent.
+MODELS/<scene>/sparse holds the COLMAP models of a scene, made from all its pairs; <scene> is the name of the folder of
+its photos. Two images overlap if they share enough points. Each scene is searched alone, and among the photos of all
+scenes. `true` counts the overlapping pairs; `recall` is the share of them that retrieval proposes, and `pairs` the
+share of all possible pairs that it proposes, both in percent.
 """
 
 import argparse
@@ -43,11 +43,11 @@ def find_overlapping(models: Path, prefix: str, min_points: int) -> set[ImagePai
 def score(
     names: Sequence[str], descriptors: np.ndarray, overlapping: set[ImagePair], tops: Sequence[int]
 ) -> dict[str, float]:
-    """Recall of the overlapping pairs, and the share of all pairs that were taken, in per cent, by `top`."""
+    """Recall of the overlapping pairs, and the share of all pairs that are proposed, in percent, by `top`."""
     scores = {}
     for top in tops:
-        found = enumerate(find_similar(descriptors, top).tolist())
-        pairs = {ImagePair.of(names[i], names[j]) for i, row in found for j in row if j >= 0}
+        similar = enumerate(find_similar(descriptors, top).tolist())
+        pairs = {ImagePair.of(names[i], names[j]) for i, row in similar for j in row if j >= 0}
         scores[f"recall@{top}"] = 100 * len(overlapping & pairs) / max(1, len(overlapping))
         scores[f"pairs@{top}"] = 100 * len(pairs) / (len(names) * (len(names) - 1) / 2)
     return scores
@@ -55,10 +55,10 @@ def score(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", metavar="PHOTOS", type=Path, nargs="+", help="a folder of photos a scene")
+    parser.add_argument("folders", metavar="PHOTOS", type=Path, nargs="+", help="one folder of photos per scene")
     parser.add_argument("--models", type=Path, required=True, help="MODELS/<scene>/sparse: its COLMAP models")
     parser.add_argument("--out", type=Path, required=True, help="folder for the encoded photos")
-    parser.add_argument("--top", type=int, nargs="+", default=[5, 10, 20], help="images found for each image")
+    parser.add_argument("--top", type=int, nargs="+", default=[5, 10, 20], help="images proposed for each image")
     parser.add_argument("--min-points", type=int, default=30, help="that overlapping images share (default: 30)")
     options = parser.parse_args()
 
@@ -77,8 +77,8 @@ def main() -> None:
         for scene, (own, overlapping) in scenes.items():
             images = own if among == "itself" else everything
             descriptors = describe_images(images, digests, matcher, store)
-            figures = score([image.name for image in images], descriptors, overlapping, options.top)
-            rows.append({"scene": scene, "among": among, "images": len(images), "true": len(overlapping), **figures})
+            scores = score([image.name for image in images], descriptors, overlapping, options.top)
+            rows.append({"scene": scene, "among": among, "images": len(images), "true": len(overlapping), **scores})
     print(format_table(rows))
 
 

@@ -1,12 +1,12 @@
 """What matching costs: milliseconds per stage, pairs per minute and peak memory, of hm_sfm and of others.
 
-    python pipelines/benchmark.py PHOTOS --sizes 1024 2048 --configs configs/light.yaml fast.yaml
-    python pipelines/benchmark.py PHOTOS --scaling 1000 --out out/scaling
+    python pipelines/benchmarks/benchmark_costs.py PHOTOS --sizes 1024 2048 --configs configs/light.yaml fast.yaml
+    python pipelines/benchmarks/benchmark_costs.py PHOTOS --scaling 1000 --out out/scaling
 
-The first form matches all pairs of the first few photos, each method and size in a process of its own. ALIKED with
-LightGlue and XFeat* are measured where they are installed, see pipelines/peers.py. The second one matches more and more
-small images, up to 1000 here, which are made of the photos by turning, scaling and cropping them, and leaves
-OUT/scaling.json and OUT/scaling.png: time and peak memory over the number of images.
+The first form matches all pairs of the first few photos, each method and size in a process of its own. ALIKED +
+LightGlue and XFeat* are measured where they are installed, see peers.py. The second form matches growing numbers of
+small images, up to 1000 here: crops of the photos, rotated and scaled. It writes OUT/scaling.json and OUT/scaling.png:
+time and peak memory over the number of images.
 """
 
 import argparse
@@ -14,16 +14,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from matching_costs import METHODS, draw_scaling, measure_in_process, write_crops
-from tables import format_table, write_json
+from tables import format_table
 
 from hm_sfm.errors import HmSfmError
+from hm_sfm.io.atomic import write_json
 
 
 def benchmark(
     photos: Path, sizes: Sequence[int], configs: Sequence[Path | None], methods: Sequence[str], count: int,
     settings: Sequence[str],
 ) -> list[dict[str, object]]:  # fmt: skip
-    """A row a method, configuration and size, without those that are not installed."""
+    """One row per method, configuration and size; methods that are not installed have none."""
     rows = []
     for size_px in sizes:
         for method in methods:
@@ -37,7 +38,7 @@ def benchmark(
 def benchmark_scaling(
     photos: Path, out: Path, largest: int, config: Path | None, settings: Sequence[str]
 ) -> list[dict[str, object]]:
-    """A row a number of images, doubled from row to row up to `largest`; leaves the curve in OUT."""
+    """One row per number of images, which doubles from row to row up to `largest`; writes the curve to OUT."""
     counts = sorted({max(2, largest >> halvings) for halvings in range(5)})
     rows = []
     for count in counts:

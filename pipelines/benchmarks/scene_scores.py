@@ -1,4 +1,4 @@
-"""What benchmark_scenes.py measures: a model's figures, and how many of its verified pairs a reference agrees with."""
+"""What benchmark_scenes.py measures: metrics of a model, and how many of its verified pairs a reference confirms."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -73,16 +73,16 @@ def is_correct(views: Sequence[pycolmap.Image], xy: Sequence[np.ndarray], max_er
     rays = [view.camera.cam_from_img(points.astype(np.float64)) for view, points in zip(views, xy)]
     usable = np.isfinite(np.hstack(rays)).all(axis=1)
     flat = [ray[usable] @ k[:2, :2].T + k[:2, 2] for ray, k in zip(rays, ks)]
-    found = estimate_pose_colmap(PointMatches(*flat), *ks, max_error_px)
+    estimate = estimate_pose_colmap(PointMatches(*flat), *ks, max_error_px)
     true = relative_pose(*(view.cam_from_world().matrix() for view in views))
-    return found is not None and bool(
-        measure_rotation_deg(found[:, :3], true[:, :3]) <= ROTATION_DEG
-        and measure_angle_deg(found[:, 3], true[:, 3]) <= DIRECTION_DEG
+    return estimate is not None and bool(
+        measure_rotation_deg(estimate[:, :3], true[:, :3]) <= ROTATION_DEG
+        and measure_angle_deg(estimate[:, 3], true[:, 3]) <= DIRECTION_DEG
     )
 
 
 def add_up(scores: Sequence[SceneScore]) -> SceneScore:
-    """The figures of one method over all scenes: sums, and means over all points."""
+    """The metrics of one method over all scenes: sums, and means over all points."""
     points = sum(score.points for score in scores)
 
     def average(field: str) -> float:

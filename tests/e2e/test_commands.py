@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from importlib.metadata import entry_points, version
+from typing import Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pycolmap
@@ -15,6 +16,8 @@ import yaml
 
 import hm_sfm
 from hm_sfm.cli import main, make_parser
+from hm_sfm.cli.parser import CONFIG_OPTIONS
+from hm_sfm.config import Config
 from hm_sfm.formats.strecha import write_strecha_cameras
 from hm_sfm.network.backbone import XFeatTrunk
 
@@ -46,6 +49,15 @@ def test_each_command_explains_itself(command, run):
     assert all(action.help for action in subparsers.choices[command]._actions)
 
 
+def test_options_name_the_words_that_the_configuration_allows():
+    options = [(key, metavar) for _, key, metavar, _ in CONFIG_OPTIONS] + [("matching.engine", "serial|ray")]
+    for key, metavar in options:
+        section, field = key.split(".")
+        kind = get_type_hints(type(getattr(Config(), section)))[field]
+        if get_origin(kind) is Literal:
+            assert metavar == "|".join(get_args(kind)), key
+
+
 def test_version(run):
     finished = run("--version")
     assert (finished.code, finished.out) == (0, f"hm-sfm {version('hm_sfm')}\n")
@@ -54,8 +66,8 @@ def test_version(run):
 def test_help_does_not_wait_for_heavy_libraries():
     heavy = {"torch", "pycolmap", "cv2", "numpy", "h5py"}
     code = f"import sys, hm_sfm, hm_sfm.cli; print(sorted({heavy} & set(sys.modules)))"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert found == "[]\n"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert printed == "[]\n"
 
 
 def test_every_public_name_is_importable():

@@ -155,7 +155,7 @@ def test_an_interrupted_comparison_goes_on(scene, reconstructed, expectation_wei
     with monkeypatch.context() as patch:
         patch.setattr("hm_sfm.evaluation.comparison.make_keypoints", interrupt)
         stopped = run(*command)
-    assert stopped.code == 130 and "goes on from here" in stopped.err
+    assert stopped.code == 130 and "run the same command again" in stopped.err
     kept = (out / "persistent" / "result.json").stat().st_mtime_ns
     assert (out / "loftr_style" / "matches.h5").exists() and not (out / "compare.json").exists()
 

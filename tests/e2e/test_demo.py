@@ -165,7 +165,7 @@ def test_ctrl_c_exits_130_and_keeps_what_is_done(scene, reconstructed, tmp_path,
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "Traceback" not in err
-    assert err.splitlines()[-1] == "hm-sfm: interrupted; the same command goes on from here"
+    assert err.splitlines()[-1] == "hm-sfm: interrupted; run the same command again to continue"
     assert run("match", scene.images, out).code == 0
     assert 0 < len(matched_pairs) <= 8
     assert_same_matches(read_matches(out / "matches.h5"), read_matches(reconstructed / "matches.h5"))

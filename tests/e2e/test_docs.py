@@ -1,5 +1,6 @@
 """What the pages of docs/ say can be typed, can be typed, and what they say of the code is so."""
 
+import argparse
 import re
 import runpy
 import shlex
@@ -62,11 +63,8 @@ def test_all_commands_parse(page):
 @pytest.mark.parametrize("page", WRITTEN)
 def test_all_options_settings_and_files_are_there(page):
     text = PAGES[page]
-    known = {
-        flag
-        for line in (ROOT / "hm_sfm" / "cli.py").read_text().splitlines()
-        for flag in re.findall(r"--[a-z-]+", line)
-    }
+    subparsers = next(a for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction))
+    known = {flag for command in subparsers.choices.values() for flag in command._option_string_actions}
     assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)) - {"--nproc-per-node", "--editable"} <= known
     for setting in re.findall(r"--set ([\w.]+)=", text):
         section, _, key = setting.partition(".")

@@ -6,10 +6,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 from hm_sfm.errors import InputError
-from hm_sfm.types import ImageRef
+from hm_sfm.keypoints.tracks import build_tracks
+from hm_sfm.types import ImageRef, Tracks
 
 ENDINGS = (".bin", ".txt")
 REQUIRED = ("cameras", "images")
@@ -97,3 +99,25 @@ def find_known(path: Path, images: Sequence[ImageRef]) -> tuple[list[pycolmap.Ca
         cameras.append(pycolmap.Camera(camera.todict()))
         poses.append(known.cam_from_world())
     return cameras, poses
+
+
+def list_observations(model: pycolmap.Reconstruction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the images of a model see: (O,) int64 each, the id of the point, the image and the index of the keypoint.
+
+    Images are numbered in the order of their ids, which is also the order of the observations; within an image they go
+    by the ids of the points. Where an image observes a point twice, the first observation counts.
+    """
+    rows = [np.zeros((3, 0), np.int64)]
+    for number, image_id in enumerate(sorted(model.reg_image_ids())):
+        image = model.image(image_id)
+        point = np.array([seen.point3D_id for seen in image.get_observation_points2D()], np.int64)
+        keypoint = np.array(image.get_observation_point2D_idxs(), np.int64)
+        point, first = np.unique(point, return_index=True)
+        rows.append(np.stack([point, np.full(len(point), number), keypoint[first]]))
+    point, number, keypoint = np.concatenate(rows, axis=1)
+    return point, number, keypoint
+
+
+def read_tracks(model: pycolmap.Reconstruction) -> Tracks:
+    """The tracks of a model's points, in the order of their ids; images are numbered in the order of their ids."""
+    return build_tracks(*list_observations(model))

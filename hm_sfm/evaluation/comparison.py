@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from hm_sfm.colmap.database import Cameras, make_cameras, open_database, write_database
 from hm_sfm.colmap.mapping import choose_mapper, map_images, summarise_models
+from hm_sfm.colmap.models import read_tracks
 from hm_sfm.colmap.verification import verify_database
 from hm_sfm.config import Config, fingerprint
 from hm_sfm.errors import ConfigError, InputError, NoModelError
@@ -31,7 +32,7 @@ from hm_sfm.formats.pairs_files import write_pairs
 from hm_sfm.formats.strecha import read_strecha_cameras
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.io.locks import release_locks
-from hm_sfm.keypoints.tracks import build_tracks, label_tracks, read_tracks
+from hm_sfm.keypoints.tracks import build_tracks, label_tracks
 from hm_sfm.matching.coarse_matches import check_coarse
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.run import match_pairs

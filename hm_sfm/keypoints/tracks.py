@@ -4,7 +4,8 @@ Keypoints are numbered through all images here: keypoint k of image i has the gl
 """
 
 import numpy as np
-import pycolmap
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from hm_sfm.types import Tracks
 
@@ -53,19 +54,11 @@ def _find_root(parent: dict[int, int], k: int) -> int:
 
 
 def label_components(count: int, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Connected components: (count,) int64 labels, each the lowest index of its component. No loop over edges."""
-    label = np.arange(count)
-    while True:
-        low = np.minimum(label[source], label[target])
-        new = label.copy()
-        np.minimum.at(new, label[source], low)
-        np.minimum.at(new, label[target], low)
-        # Follow labels to their ends: path lengths halve, so a long chain needs few rounds.
-        while not np.array_equal(new, new[new]):
-            new = new[new]
-        if np.array_equal(new, label):
-            return label
-        label = new
+    """Connected components: (count,) int64 labels, each the lowest index of its component."""
+    edges = coo_array((np.ones(len(source), bool), (source, target)), shape=(count, count))
+    _, component = connected_components(edges, directed=False)
+    _, lowest = np.unique(component, return_index=True)
+    return lowest[component]
 
 
 def build_tracks(label: np.ndarray, image: np.ndarray, keypoint: np.ndarray, min_length: int = 2) -> Tracks:
@@ -74,7 +67,7 @@ def build_tracks(label: np.ndarray, image: np.ndarray, keypoint: np.ndarray, min
     label, image, keypoint: (K,) int64 per keypoint: its track, its image and its index within that image.
     """
     order = np.lexsort((image, label))
-    _, first, length = np.unique(label[order], return_index=True, return_counts=True)
+    _, length = np.unique(label[order], return_counts=True)
     kept = length >= min_length
     inside = np.repeat(kept, length)
     offsets = np.r_[0, np.cumsum(length[kept])]
@@ -85,28 +78,6 @@ def measure_lengths(label: np.ndarray) -> np.ndarray:
     """(K,) int64: for each keypoint, how many keypoints its track holds."""
     _, inverse, count = np.unique(label, return_inverse=True, return_counts=True)
     return count[inverse]
-
-
-def list_observations(model: pycolmap.Reconstruction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the images of a model see: (O,) int64 each, the id of the point, the image and the index of the keypoint.
-
-    Images are numbered in the order of their ids, which is also the order of the observations; within an image they go
-    by the ids of the points. Where an image observes a point twice, the first observation counts.
-    """
-    rows = [np.zeros((3, 0), np.int64)]
-    for number, image_id in enumerate(sorted(model.reg_image_ids())):
-        image = model.image(image_id)
-        point = np.array([seen.point3D_id for seen in image.get_observation_points2D()], np.int64)
-        keypoint = np.array(image.get_observation_point2D_idxs(), np.int64)
-        point, first = np.unique(point, return_index=True)
-        rows.append(np.stack([point, np.full(len(point), number), keypoint[first]]))
-    point, number, keypoint = np.concatenate(rows, axis=1)
-    return point, number, keypoint
-
-
-def read_tracks(model: pycolmap.Reconstruction) -> Tracks:
-    """The tracks of a model's points, in the order of their ids; images are numbered in the order of their ids."""
-    return build_tracks(*list_observations(model))
 
 
 def count_neighbours(tracks: Tracks, num_images: int) -> np.ndarray:

@@ -27,15 +27,10 @@ from hm_sfm.formats.hloc import write_features, write_matches
 from hm_sfm.formats.pairs_files import read_pairs, write_pairs
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.io.locks import lock_file, release_locks, wait_in_line
-from hm_sfm.keypoints.propagation import (
-    KeypointGraph,
-    Photo,
-    find_seeds,
-    finish_keypoints,
-    propagate_keypoints,
-    prune_edges,
-)
-from hm_sfm.keypoints.refinement import refine_keypoints
+from hm_sfm.keypoints.graph import Photo
+from hm_sfm.keypoints.persistence import persist_keypoints
+from hm_sfm.keypoints.refinement import KeypointRefiner
+from hm_sfm.keypoints.seeds import find_seeds
 from hm_sfm.matching.coarse_matches import check_coarse, describe_coarse
 from hm_sfm.matching.matcher import HomoMatcher, digest_weights
 from hm_sfm.matching.run import check_engine, match_pairs
@@ -313,7 +308,7 @@ def persist_verified(
     """persist_keypoints over the verified pairs, strongest first. Raises InputError on an undecodable photo.
 
     store: what the pairs were verified with. masks: no keypoint lies in a masked pixel. seeds: by image name, (N, 2) px
-    of the stored image, best first, the points that keypoints may be founded at, exact ones; None finds some in the photos.
+    of the stored image, best first, the points that keypoints may start at, exact ones; None finds some in the photos.
 
     Returns the Keypoints of every image, in the order of `images`, and the IndexMatches of the pairs that share tracks.
     """
@@ -330,30 +325,27 @@ def persist_verified(
         for image in tqdm(images, desc="seeds", unit="image", disable=quiet)
     ]
     ranked = sorted(verified.values(), key=lambda found: (-found.strength, found.pair))
-    graph = propagate_keypoints(
+    unmasked = store.store if isinstance(store, MaskedStore) else store
+    return persist_keypoints(
         photos,
         [found.pair for found in ranked],
         lambda pair: store.read(pair).select(verified[pair].inliers),
         config.keypoints,
+        make_refiner(images, unmasked, config),
         quiet,
     )
-    if config.keypoints.refine_long_edge_px and config.network.head == "homography":
-        graph = prune_edges(graph, config.keypoints)  # the second pass is worth its time for what is kept only
-        graph = sharpen(graph, images, store.store if isinstance(store, MaskedStore) else store, config, quiet)
-    return finish_keypoints(graph, config.keypoints)
 
 
-def sharpen(
-    graph: KeypointGraph, images: Sequence[ImageRef], store: MatchStore, config: Config, quiet: bool
-) -> KeypointGraph:
-    """refine_keypoints with the matcher of the configuration; what is done is kept beside the matches."""
+def make_refiner(images: Sequence[ImageRef], store: MatchStore, config: Config) -> KeypointRefiner | None:
+    """What refines keypoints, where the configuration and the network can."""
+    if not config.keypoints.refine_long_edge_px or config.network.head != "homography":
+        return None
     # The coarse matches are made already, whoever made them.
     matching = dataclasses.replace(config.matching, coarse="light", coarse_matches="", coarse_features="")
     matcher = HomoMatcher.from_pretrained(matching.model, config=matching, images=config.images, network=config.network)
-    refine_long_edge_px = max(config.keypoints.refine_long_edge_px, config.images.long_edge_px)
-    made_by = {**store.made_by, "keypoints.refine_long_edge_px": refine_long_edge_px}
-    path = store.path.with_name("refined.h5")
-    return refine_keypoints(graph, images, matcher, refine_long_edge_px, path, made_by, store.digests, quiet)
+    return KeypointRefiner(
+        matcher, images, max(config.keypoints.refine_long_edge_px, config.images.long_edge_px), store
+    )
 
 
 def write_summary(

@@ -11,8 +11,9 @@ import numpy as np
 import pycolmap
 
 from hm_sfm.colmap.database import open_database, read_verified_matches
+from hm_sfm.colmap.models import list_observations
 from hm_sfm.config import Config, fingerprint
-from hm_sfm.keypoints.tracks import build_tracks, count_neighbours, list_observations
+from hm_sfm.keypoints.tracks import build_tracks, count_neighbours
 from hm_sfm.photos.images import prepare_image
 from hm_sfm.report.diagnosis import Diagnosis
 from hm_sfm.report.drawn_matches import draw_photo_matches

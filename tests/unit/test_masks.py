@@ -8,7 +8,8 @@ import pytest
 
 from hm_sfm.config import KeypointConfig, MaskConfig
 from hm_sfm.errors import InputError
-from hm_sfm.keypoints.propagation import Photo, persist_keypoints
+from hm_sfm.keypoints.graph import Photo
+from hm_sfm.keypoints.persistence import persist_keypoints
 from hm_sfm.photos.masks import MaskedStore, Masks, read_masks
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 

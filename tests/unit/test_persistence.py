@@ -6,22 +6,10 @@ import numpy as np
 import pytest
 
 from hm_sfm.config import KeypointConfig
-from hm_sfm.keypoints.propagation import (
-    MIN_PROPAGATING,
-    Photo,
-    choose_good,
-    differentiate,
-    find_anchors,
-    find_seeds,
-    finish_keypoints,
-    group_matches,
-    persist_keypoints,
-    propagate_keypoints,
-    prune_edges,
-    thin_points,
-)
-from hm_sfm.keypoints.selection import rank_in_groups, select_keypoints
-from hm_sfm.photos.images import prepare_array
+from hm_sfm.keypoints.graph import FlatGraph, KeypointGraph, Photo
+from hm_sfm.keypoints.persistence import collect_keypoints, group_matches, persist_keypoints
+from hm_sfm.keypoints.propagation import MIN_PROPAGATING, choose_good, propagate_keypoints
+from hm_sfm.keypoints.settled_tracks import prune_edges
 from hm_sfm.types import ImagePair, PairMatches, apply_homographies
 
 CONFIG = KeypointConfig()
@@ -98,7 +86,7 @@ def find_tracks(matches) -> list[frozenset[tuple[str, int]]]:
 # Hand-drawn
 
 
-def test_a_seed_founds_a_keypoint_in_both_images():
+def test_a_seed_starts_a_keypoint_in_both_images():
     keypoints, matches, tracks = persist(
         [make_photo("a", (40.0, 30.0)), make_photo("b")], [make_pair("a", "b", shift(7.5, -3.25))]
     )
@@ -109,7 +97,7 @@ def test_a_seed_founds_a_keypoint_in_both_images():
     assert [len(track) for track in tracks] == [2]
 
 
-def test_a_keypoint_is_carried_and_joined_in_the_third_image():
+def test_a_keypoint_is_propagated_and_joined_in_the_third_image():
     photos = [make_photo("a", (40.0, 30.0)), make_photo("b"), make_photo("c")]
     pairs = [make_pair("a", "b", shift(5, 0)), make_pair("a", "c", shift(0, 9)), make_pair("b", "c", shift(-5, 9))]
     keypoints, matches, tracks = persist(photos, pairs)
@@ -128,7 +116,7 @@ def test_predictions_that_disagree_a_little_are_averaged():
     assert 0.1 < apart[0] < 0.5 and apart[1] == pytest.approx(9, abs=1e-3)
 
 
-def test_a_keypoint_is_carried_back_through_the_inverse():
+def test_a_keypoint_is_propagated_back_through_the_inverse():
     """B has the keypoint first, from its pair with c; a, which is in more pairs, gets it from b."""
     linear = np.array([[1.2, -0.2, 4], [0.1, 0.9, -2], [1e-4, -2e-4, 1]])
     names = "abcdefg"
@@ -167,7 +155,7 @@ def test_keypoints_keep_their_distance():
     assert np.ptp(keypoints["b"].xy[:, 0]) > CONFIG.separation_px
 
 
-def test_a_conflict_is_split_and_the_weaker_link_lost():
+def test_a_conflict_is_split_and_the_weaker_edge_lost():
     """The pair (b, c) contradicts the two stronger ones by 6 px: c would get two keypoints of one track."""
     photos = [make_photo("a", (40.0, 30.0)), make_photo("b"), make_photo("c")]
     pairs = [
@@ -181,13 +169,13 @@ def test_a_conflict_is_split_and_the_weaker_link_lost():
     np.testing.assert_allclose(keypoints["c"].xy, [[40, 39]], atol=0.1)
 
 
-def test_what_falls_outside_the_other_image_is_not_carried():
+def test_what_falls_outside_the_other_image_is_not_propagated():
     photos = [make_photo("a", (10.0, 50.0), (60.0, 50.0)), make_photo("b")]
     keypoints, _, _ = persist(photos, [make_pair("a", "b", shift(-20, 0))])
     np.testing.assert_allclose(keypoints["a"].xy, [[60, 50]], atol=1e-3)
 
 
-def test_seeds_beyond_all_patches_are_not_carried():
+def test_seeds_beyond_all_patches_are_not_propagated():
     pair = make_pair("a", "b", np.eye(3))
     keep = [0]
     pair = dataclasses.replace(
@@ -263,8 +251,8 @@ def test_keypoints_of_a_plane_are_where_the_homographies_say(scene, persisted):
     for pair in scene[1]:
         found = matches[pair.pair]
         xy0, xy1 = keypoints[pair.pair.name0].xy, keypoints[pair.pair.name1].xy
-        truth = pair.homography[:1] / pair.homography[0, 2, 2]
-        expected = apply_homographies(np.tile(truth, (len(found), 1, 1)), xy0[found.indices[:, 0]])
+        ground_truth = pair.homography[:1] / pair.homography[0, 2, 2]
+        expected = apply_homographies(np.tile(ground_truth, (len(found), 1, 1)), xy0[found.indices[:, 0]])
         np.testing.assert_allclose(xy1[found.indices[:, 1]], expected, atol=0.02)
 
 
@@ -308,18 +296,18 @@ def test_the_same_input_gives_the_same_result(scene, persisted):
         assert found.indices.tobytes() == persisted[1][pair].indices.tobytes()
 
 
-def test_the_budget_takes_longer_tracks_and_spreads(scene, persisted):
-    budget = 40
-    keypoints, _, tracks = persist(*scene, dataclasses.replace(CONFIG, max_keypoints=budget))
+def test_selection_takes_longer_tracks_and_spreads(scene, persisted):
+    most = 40
+    keypoints, _, tracks = persist(*scene, dataclasses.replace(CONFIG, max_keypoints=most))
     counts = [len(found) for found in keypoints.values()]
-    assert max(counts) <= 2 * budget and np.mean(counts) <= 1.3 * budget and min(counts) >= budget / 2
+    assert max(counts) <= 2 * most and np.mean(counts) <= 1.3 * most and min(counts) >= most / 2
     assert np.mean([len(track) for track in tracks]) > np.mean([len(track) for track in persisted[2]])
     for found in keypoints.values():
         quarters = {tuple(quarter) for quarter in (found.xy // (np.array(SIZE_WH) / 2)).tolist()}
         assert len(quarters) == 4
 
 
-def test_a_generous_budget_changes_nothing(scene, persisted):
+def test_a_high_limit_changes_nothing(scene, persisted):
     keypoints, _, _ = persist(*scene, dataclasses.replace(CONFIG, max_keypoints=100_000))
     assert {name: len(found) for name, found in keypoints.items()} == {
         name: len(found) for name, found in persisted[0].items()
@@ -337,74 +325,32 @@ def test_keypoints_end_at_exact_seeds():
         assert np.linalg.norm(apart) < 0.03 if not exact else 0.05 < np.linalg.norm(apart) < 0.36
 
 
-def test_anchors_are_the_nearest_exact_seeds_of_the_own_photo():
-    photos = [
-        dataclasses.replace(make_photo("a", (10, 10), (30, 30), (50, 50), px_scale=2.0), seeds_are_exact=True),
-        make_photo("b", (10, 10)),
-        dataclasses.replace(make_photo("c", (10, 10)), seeds_are_exact=True),
-    ]
-    # Of two near one seed the nearer is held; one is too far from any.
-    xy = [np.array([[5.4, 5.0], [5.1, 5.0], [15.0, 16.5]]), np.array([[10.0, 10.0]]), np.array([[10.2, 10.0]])]
-    anchors = find_anchors(photos, xy)
-    assert anchors.keypoint.tolist() == [1, 4]
-    assert anchors.xy.tolist() == [[5, 5], [10, 10]]
-
-
-def test_thinned_links_are_those_that_the_budget_keeps(scene):
+def test_pruned_edges_are_those_of_selected_keypoints(scene):
     by_pair = {matches.pair: matches for matches in scene[1]}
     config = dataclasses.replace(CONFIG, max_keypoints=40)
     graph = propagate_keypoints(scene[0], list(by_pair), by_pair.__getitem__, config, quiet=True)
-    thinned = prune_edges(graph, config)
-    of_all, of_thinned = (sum(len(links.source) for links in of.links) for of in (graph, thinned))
-    assert 0 < of_thinned < 0.6 * of_all
-    (keypoints, matches), (few_keypoints, few_matches) = (
-        finish_keypoints(graph, config),
-        finish_keypoints(thinned, config),
+    pruned = prune_edges(graph, config)
+    of_all, of_pruned = (sum(len(edges.source) for edges in of.edges) for of in (graph, pruned))
+    assert 0 < of_pruned < 0.6 * of_all
+    (keypoints, matches), (again_keypoints, again_matches) = (
+        collect_keypoints(graph, config),
+        collect_keypoints(pruned, config),
     )
-    for found, again in zip(keypoints, few_keypoints, strict=True):
+    for found, again in zip(keypoints, again_keypoints, strict=True):
         np.testing.assert_allclose(found.xy, again.xy, atol=0.02)
-    for found, again in zip(matches, few_matches, strict=True):
+    for found, again in zip(matches, again_matches, strict=True):
         assert found.pair == again.pair and np.array_equal(found.indices, again.indices)
 
 
-def test_nothing_is_thinned_to_nothing():
+def test_nothing_is_pruned_to_nothing():
     graph = propagate_keypoints([make_photo("a")], [], {}.__getitem__, CONFIG, quiet=True)
-    assert prune_edges(graph, CONFIG).links == ()
+    assert prune_edges(graph, CONFIG).edges == ()
 
 
 # Parts
 
 
-def test_the_budget_prefers_long_then_certain_tracks():
-    # Two images, six tracks in one cell; the first track is of three images, so longer.
-    label = np.array([0, 1, 2, 3, 0, 1, 2, 3, 0])
-    image = np.array([0, 0, 0, 0, 1, 1, 1, 1, 2])
-    sigma = np.array([0.9, 0.5, 0.1, 0.3] * 2 + [0.9])
-    length = np.bincount(label)[label]
-    xy = np.tile([[5.0, 5.0]], (9, 1))
-    for budget, kept in ((1, {0}), (2, {0, 2}), (3, {0, 2, 3}), (9, {0, 1, 2, 3}), (0, set())):
-        chosen = select_keypoints(label, length, sigma, xy, image, budget)
-        assert set(label[chosen].tolist()) == kept
-        assert set(label[~chosen].tolist()).isdisjoint(kept), "whole tracks are kept"
-
-
-def test_the_budget_spreads_among_equals():
-    # One image, 20 keypoints in one cell and one each in four others.
-    xy = np.r_[np.full((20, 2), 5.0), [[40, 5], [70, 5], [5, 40], [5, 70]]]
-    chosen = select_keypoints(np.arange(24), np.full(24, 2), np.ones(24), xy, np.zeros(24, int), 8)
-    assert chosen.sum() == 8 and chosen[20:].all()
-
-
-def test_the_budget_of_nothing():
-    none = np.zeros(0, int)
-    assert len(select_keypoints(none, none, np.zeros(0), np.zeros((0, 2)), none, 5)) == 0
-
-
-def test_ranks_start_anew_in_every_group():
-    assert rank_in_groups(np.array([3, 3, 3, 5, 7, 7])).tolist() == [0, 1, 2, 0, 0, 1]
-
-
-def test_good_matches_carry_and_of_few_good_ones_the_best():
+def test_good_matches_propagate_and_of_few_good_ones_the_best():
     rng = np.random.default_rng(0)
     many_good = rng.permutation(np.linspace(0.5, 1.0, 400))
     assert np.array_equal(choose_good(many_good, 0.7, 100), many_good >= 0.7)
@@ -414,7 +360,7 @@ def test_good_matches_carry_and_of_few_good_ones_the_best():
     assert choose_good(np.zeros(0), 0.7, 100).shape == (0,)
 
 
-def test_doubtful_patches_carry_nothing_where_there_are_better_ones():
+def test_doubtful_patches_propagate_nothing_where_there_are_better_ones():
     """Doubtful patches shift by 5 px more, and lie where the seed is."""
     sure, doubtful = make_pair("a", "b", shift(7, 0)), make_pair("a", "b", shift(12, 0), score=0.6)
     around = np.linalg.norm(sure.xy0 - (40, 30), axis=1) < 25
@@ -432,60 +378,84 @@ def test_doubtful_patches_carry_nothing_where_there_are_better_ones():
     assert len(persist(exact, [matches])[2]) == 1
 
 
-def test_thinning_keeps_the_best_and_the_distance():
-    xy = np.array([[0.0, 0.0], [1.0, 0.0], [5.0, 0.0], [5.5, 0.0], [20.0, 0.0]])
-    assert thin_points(xy, 2.0).tolist() == [True, False, True, False, True]
-    assert thin_points(np.zeros((0, 2)), 2.0).shape == (0,)
-    rng = np.random.default_rng(0)
-    kept = rng.uniform(0, 50, (500, 2))
-    kept = kept[thin_points(kept, 2.0)]
-    apart = np.linalg.norm(kept[:, None] - kept[None], axis=2)
-    assert len(kept) > 50 and apart[~np.eye(len(kept), dtype=bool)].min() > 2.0
-
-
-def test_the_derivative_of_a_homography():
-    homography = np.array([[[1.2, -0.2, 4], [0.1, 0.9, -2], [1e-3, -2e-3, 1]]])
-    xy, step = np.array([[30.0, 40.0]]), 1e-3
-    numeric = np.stack(
-        [
-            (map_exactly(homography[0], xy[0] + offset) - map_exactly(homography[0], xy[0] - offset)) / (2 * step)
-            for offset in step * np.eye(2)
-        ],
-        axis=1,
-    )
-    np.testing.assert_allclose(differentiate(homography, xy)[0], numeric, atol=1e-6)
-    assert differentiate(np.zeros((0, 3, 3)), np.zeros((0, 2))).shape == (0, 2, 2)
-
-
-def map_exactly(homography: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    mapped = homography @ [*xy, 1.0]
-    return mapped[:2] / mapped[2]
-
-
 def test_matches_are_grouped_by_pair_in_the_order_of_names():
-    # Image 0 is "z", image 1 is "a"; the link 0 -> 2 is told twice.
-    photos = [make_photo("z"), make_photo("a")]
+    # Image 0 is "z", image 1 is "a"; the edge 0 -> 2 is there twice.
     image, index = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
-    (found,) = group_matches(photos, image, index, np.array([0, 2, 1]), np.array([2, 0, 3]), np.array([0.5, 0.7, 0.2]))
+    graph = FlatGraph(
+        image,
+        xy=np.zeros((4, 2)),
+        source=np.array([0, 2, 1]),
+        target=np.array([2, 0, 3]),
+        predicted=np.zeros((3, 2)),
+        jacobian=np.zeros((3, 2, 2)),
+        score=np.array([0.5, 0.7, 0.2]),
+    )
+    (found,) = group_matches(["z", "a"], graph, index)
     assert found.pair == ImagePair("a", "z")
     assert found.indices.tolist() == [[0, 0], [1, 1]]
     np.testing.assert_allclose(found.score, [0.7, 0.2])
 
 
-def test_seeds_are_at_corners():
-    pixels = np.zeros((64, 96), np.uint8)
-    pixels[20:44, 27:70] = 255
-    seeds = find_seeds(prepare_array(pixels, 96))
-    assert len(seeds) == 12 * 8
-    for corner in ([27, 20], [70, 20], [27, 44], [70, 44]):
-        assert np.linalg.norm(seeds[:4] - corner, axis=1).min() < 2
-    cells = np.floor(seeds / 8)
-    assert len(np.unique(cells, axis=0)) == len(cells)
+# Settings
 
 
-def test_seeds_of_a_reduced_photo_are_in_stored_pixels():
-    pixels = np.zeros((128, 192), np.uint8)
-    pixels[40:88, 54:140] = 255
-    seeds = find_seeds(prepare_array(pixels, 96))
-    for corner in ([54, 40], [140, 40], [54, 88], [140, 88]):
-        assert np.linalg.norm(seeds[:4] - corner, axis=1).min() < 4
+def test_the_score_from_which_matches_propagate_is_a_setting():
+    """The best 100 matches propagate keypoints anyhow; four around the seed do so if their score is high enough."""
+    pair = make_pair("a", "b", shift(7, 0))
+    order = np.argsort(np.linalg.norm(pair.xy0 - (40, 30), axis=1))
+    pair = pair.select(order)
+    near, far = pair.select(np.arange(4)), pair.select(np.arange(30, len(pair)))
+    assert len(far) > MIN_PROPAGATING
+    joined = {
+        field: np.concatenate([getattr(far, field), getattr(near, field)]) for field in ("xy0", "xy1", "homography")
+    }
+    matches = dataclasses.replace(pair, **joined, score=np.r_[np.full(len(far), 0.9), np.full(len(near), 0.6)])
+    photos = [make_photo("a", (40.0, 30.0)), make_photo("b")]
+    for min_score, tracks in ((0.55, 1), (0.65, 0)):
+        config = dataclasses.replace(CONFIG, propagation_min_score=min_score)
+        assert len(persist(photos, [matches], config)[2]) == tracks
+
+
+def test_how_far_a_patch_propagates_points_is_a_setting():
+    """A single patch whose centre is 5 px away from the seed."""
+    pair = make_pair("a", "b", shift(7, 0)).select(np.array([20]))
+    x, y = pair.xy0[0]
+    photos = [make_photo("a", (x + 3.0, y + 4.0)), make_photo("b")]
+    for radius_px, tracks in ((4.9, 0), (5.1, 1)):
+        config = dataclasses.replace(CONFIG, propagation_radius_px=radius_px)
+        assert len(persist(photos, [pair], config)[2]) == tracks
+
+
+def test_how_far_seeds_keep_from_keypoints_is_a_setting():
+    """The pair (a, b) is walked first and starts a keypoint in b, 4 px away from b's own seed."""
+    names = "abcde"
+    seeds = {"a": (40.0, 30.0), "b": (44.0, 30.0)}
+    photos = [make_photo(name, *([seeds[name]] if name in seeds else [])) for name in names]
+    # Keypoints of (a, b) start in a, which is in more pairs; those of (b, c) start in b.
+    pairs = [make_pair("a", "b", np.eye(3)), make_pair("b", "c", np.eye(3))]
+    pairs += [make_no_matches("a", other) for other in "cde"]
+    for spacing_px, count in ((3.9, 2), (4.1, 1)):
+        config = dataclasses.replace(CONFIG, seed_spacing_px=spacing_px)
+        keypoints, _, _ = persist(photos, pairs, config)
+        assert len(keypoints["b"]) == len(keypoints["c"]) == count
+
+
+# Refinement
+
+
+def test_what_is_refined_are_the_edges_that_tracks_use_and_its_result_is_what_counts(scene):
+    """A refiner that gives up all edges of one pair: the rest of the chain takes what it returns."""
+    config = dataclasses.replace(CONFIG, max_keypoints=40)
+    by_pair = {matches.pair: matches for matches in scene[1]}
+    pruned = prune_edges(propagate_keypoints(scene[0], list(by_pair), by_pair.__getitem__, config, quiet=True), config)
+    given: list[KeypointGraph] = []
+
+    class Refiner:
+        def refine(self, graph: KeypointGraph, quiet: bool = False) -> KeypointGraph:
+            given.append(graph)
+            kept = [edges for edges in graph.edges if {edges.source_image, edges.target_image} != {0, 1}]
+            return dataclasses.replace(graph, edges=tuple(kept))
+
+    _, matches = persist_keypoints(scene[0], list(by_pair), by_pair.__getitem__, config, refiner=Refiner(), quiet=True)
+    assert [len(edges.source) for edges in given[0].edges] == [len(edges.source) for edges in pruned.edges]
+    assert ImagePair("a", "b") not in {found.pair for found in matches} and len(matches) == len(by_pair) - 1

@@ -1,0 +1,176 @@
+"""Patches around propagated keypoints, estimated by the network: what keypoint refinement asks of it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+
+from hm_sfm.matching.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
+from hm_sfm.matching.matcher import (
+    HomoMatcher,
+    autocast,
+    cell_to_px,
+    computes_in_half,
+    make_start,
+    pad_image,
+    round_to_cells,
+    score_from_scale,
+)
+from hm_sfm.network.fine import FineMap, make_fine_map
+from hm_sfm.network.homography import is_regular
+from hm_sfm.photos.images import PreparedImage, prepare_image
+from hm_sfm.types import ImagePair, ImageRef, PairMatches
+
+STRIP_PX = 1024
+"""Large photos are encoded in strips of so many rows, to bound the memory,"""
+MARGIN_PX = 128
+"""with so many more on each side as the network looks around. Both are multiples of any backbone's stride."""
+ITERATIONS = 1
+"""Updates of the homographies, which start close to the result: a second one changes nothing that can be measured."""
+
+
+@dataclass(frozen=True)
+class RefinementFeatures:
+    """Fine features of a photo at the size that keypoints are refined at."""
+
+    fine: FineMap
+    stored_from_scaled: np.ndarray
+    """(3, 3) float64: px of the network's input -> px of the stored image."""
+    downscale: float = 1
+    """See Hypothesis."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where propagation put the keypoints of a pair, from the first photo of the pair to the second.
+
+    Several TrackEdges of the pair one after another; px of the stored images.
+    """
+
+    xy0: np.ndarray
+    """(N, 2)."""
+    xy1: np.ndarray
+    """(N, 2)."""
+    linear: np.ndarray
+    """(N, 2, 2): how xy1 moves with xy0."""
+
+    def select(self, chosen: slice) -> "Placement":
+        """The chosen ones."""
+        return Placement(self.xy0[chosen], self.xy1[chosen], self.linear[chosen])
+
+
+class PatchRefiner:
+    """Estimates patches around keypoints, on photos whose longer sides are reduced to `long_edge_px`.
+
+    The features of the photos used last are kept, as many as fit into matching.feature_cache_mb.
+    """
+
+    def __init__(self, matcher: HomoMatcher, images: Sequence[ImageRef], long_edge_px: int) -> None:
+        self.matcher, self.long_edge_px = matcher, long_edge_px
+        self.images = {image.name: image for image in images}
+        largest_px = max((math.prod(size_at(image, long_edge_px)) for image in images), default=1)
+        backbone = matcher.net.backbone
+        bytes_per_number = 2 if computes_in_half(matcher.device) else 4
+        bytes_per_px = bytes_per_number * backbone.fine_channels / backbone.fine_grid.stride**2
+        self.cached_photos = max(2, int(matcher.config.feature_cache_mb * 1e6 / (largest_px * bytes_per_px)))
+        self.encode = lru_cache(self.cached_photos)(self._encode)
+
+    def _encode(self, name: str, hypothesis: Hypothesis) -> RefinementFeatures:
+        image = prepare_image(self.images[name], self.long_edge_px)
+        return encode_for_refinement(self.matcher, image, hypothesis)
+
+    def refine_pair(self, pair: ImagePair, placement: Placement) -> PairMatches:
+        """Matches in the order of `placement`, from where its keypoints lie in the first photo.
+
+        The score is the probability that a match is off by less than 1 px of the photo at `long_edge_px`; it is 0 where
+        the patch is of no use. Raises InputError on an undecodable photo.
+        """
+        names = (pair.name0, pair.name1)
+        hypotheses = fit_hypotheses(relate_inputs(*(self.encode(name, IDENTITY) for name in names), placement))
+        return estimate_pair(self.matcher, *map(self.encode, names, hypotheses), pair, placement)
+
+
+def size_at(image: ImageRef, long_edge_px: int) -> tuple[float, float]:
+    """(w, h) of a photo whose longer side is reduced to long_edge_px."""
+    scale = min(1.0, long_edge_px / max(image.size_wh))
+    return image.size_wh[0] * scale, image.size_wh[1] * scale
+
+
+def relate_inputs(features0: RefinementFeatures, features1: RefinementFeatures, placement: Placement) -> np.ndarray:
+    """(N, 2, 2): how points of the network's second input move with those of the first."""
+    scaled_from_stored1 = np.linalg.inv(features1.stored_from_scaled)
+    return scaled_from_stored1[:2, :2] @ placement.linear @ features0.stored_from_scaled[:2, :2]
+
+
+def fit_hypotheses(linear: np.ndarray) -> tuple[Hypothesis, Hypothesis]:
+    """The rotation and scale at which patches of one photo are upright, and about as large, in the other.
+
+    linear: (N, 2, 2), see relate_inputs. The second photo is turned by quarters, the closer one reduced by powers of 2.
+    """
+    along, across = np.median(linear[:, 0, 0] + linear[:, 1, 1]), np.median(linear[:, 1, 0] - linear[:, 0, 1])
+    rotation_deg = -90 * round(np.rad2deg(np.arctan2(across, along)) / 90) % 360
+    octaves = round(np.log2(np.sqrt(np.median(np.abs(np.linalg.det(linear))))))
+    return Hypothesis(downscale=2 ** max(0, -octaves)), Hypothesis(rotation_deg, 2 ** max(0, octaves))
+
+
+@torch.inference_mode()
+def encode_for_refinement(
+    matcher: HomoMatcher, image: PreparedImage, hypothesis: Hypothesis = IDENTITY
+) -> RefinementFeatures:
+    """The fine features of a photo, strip by strip: what the backbone makes of the whole, but for the last digits."""
+    image = apply_hypothesis(image, hypothesis)
+    backbone = matcher.net.backbone
+    pixels = pad_image(torch.tensor(image.grey, device=matcher.device), backbone.stride, backbone.standardised)
+    stride, height = backbone.fine_grid.stride, pixels.shape[2]
+    strips = []
+    for top in range(0, height, STRIP_PX):
+        first, last = max(0, top - MARGIN_PX), min(height, top + STRIP_PX + MARGIN_PX)
+        with autocast(matcher.device):
+            fine = backbone(pixels[:, :, first:last]).fine
+        bottom = min(height, top + STRIP_PX)
+        strips.append(fine[:, :, (top - first) // stride : (bottom - first) // stride])
+    return RefinementFeatures(make_fine_map(torch.cat(strips, dim=2)), image.stored_from_scaled, hypothesis.downscale)
+
+
+@torch.inference_mode()
+def estimate_pair(
+    matcher: HomoMatcher,
+    features0: RefinementFeatures,
+    features1: RefinementFeatures,
+    pair: ImagePair,
+    placement: Placement,
+) -> PairMatches:
+    """PatchRefiner.refine_pair by the features of the two photos."""
+    grid, head = matcher.net.backbone.fine_grid, matcher.net.head
+    scaled0, scaled1 = (np.linalg.inv(features.stored_from_scaled) for features in (features0, features1))
+    xy0, xy1 = (
+        xy @ scaled[:2, :2].T + scaled[:2, 2] for xy, scaled in ((placement.xy0, scaled0), (placement.xy1, scaled1))
+    )
+    linear = relate_inputs(features0, features1, placement)
+    cell0, rest0 = round_to_cells(xy0, grid)
+    cell1, rest1 = round_to_cells(xy1, grid)
+    start = make_start(rest0, rest1, linear, head.half).to(matcher.device)
+    cells = cell0.to(matcher.device), cell1.to(matcher.device)
+    homography, log_scale = matcher.estimate_patches(features0.fine, features1.fine, *cells, start, ITERATIONS)
+    regular = is_regular(homography, head.half).cpu().numpy()
+
+    stored0 = features0.stored_from_scaled @ cell_to_px(cell0.numpy(), grid)
+    stored1 = features1.stored_from_scaled @ cell_to_px(cell1.numpy(), grid)
+    between = stored1 @ homography.cpu().numpy().astype(np.float64) @ np.linalg.inv(stored0)
+    between[~regular] = np.eye(3)
+    at = np.einsum("nij,nj->ni", between, np.concatenate([placement.xy0, np.ones((len(between), 1))], axis=1))
+    score = score_from_scale(log_scale.cpu().numpy().astype(np.float64), grid)
+    if features1.downscale > 1:  # a px of the photo at `long_edge_px` is less than one of the reduced input
+        score = 1 - (1 - score) ** (1 / features1.downscale)
+    px_per_cell = np.sqrt(abs(np.linalg.det(features0.stored_from_scaled[:2, :2]))) * grid.stride
+    return PairMatches(
+        pair=pair,
+        xy0=placement.xy0,
+        xy1=at[:, :2] / at[:, 2:],
+        score=np.where(regular, score, 0.0),
+        homography=between / at[:, 2, None, None],
+        patch_radius_px=float(head.half * px_per_cell),
+    )

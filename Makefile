@@ -6,13 +6,17 @@ VENV := .venv
 TORCH := $(shell command -v nvidia-smi >/dev/null 2>&1 && echo "torch" \
 	|| echo "torch==2.13.0 --extra-index-url https://download.pytorch.org/whl/cpu")
 
-.PHONY: demo test setup
+.PHONY: demo test docs setup
 
 demo: setup
 	$(VENV)/bin/hm-sfm demo out/demo
 
 test: setup
 	$(VENV)/bin/python -m pytest
+
+# The reference of the Python API, docs/api.md, from the docstrings.
+docs: setup
+	$(VENV)/bin/python docs/make_api_reference.py
 
 setup: $(VENV)/installed
 

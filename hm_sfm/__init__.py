@@ -1,29 +1,48 @@
 """Structure from Motion from detector-free matches with homographies and persistent keypoints."""
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-_MODULE_OF = {
-    "Config": "config",
-    "HomoMatcher": "matching.matcher",
-    "ImagePair": "types",
-    "IndexMatches": "types",
-    "Keypoints": "types",
-    "MappingResult": "types",
-    "PairMatches": "types",
-    "PatchMatches": "types",
-    "Tracks": "types",
-    "export_database": "pipeline.reconstruction",
-    "load_config": "config",
-    "match_photos": "pipeline.reconstruction",
-    "reconstruct": "pipeline.reconstruction",
-}
+if TYPE_CHECKING:
+    from hm_sfm.config import Config, load_config
+    from hm_sfm.matching.matcher import HomoMatcher
+    from hm_sfm.pipeline.reconstruction import export_database, match_photos, reconstruct
+    from hm_sfm.types import ImagePair, IndexMatches, Keypoints, MappingResult, PairMatches, PatchMatches, Tracks
 
-__all__ = list(_MODULE_OF)
+__all__ = [
+    "Config",
+    "HomoMatcher",
+    "ImagePair",
+    "IndexMatches",
+    "Keypoints",
+    "MappingResult",
+    "PairMatches",
+    "PatchMatches",
+    "Tracks",
+    "export_database",
+    "load_config",
+    "match_photos",
+    "reconstruct",
+]
+
+_EXPORTS = {
+    "hm_sfm.config": ("Config", "load_config"),
+    "hm_sfm.matching.matcher": ("HomoMatcher",),
+    "hm_sfm.pipeline.reconstruction": ("export_database", "match_photos", "reconstruct"),
+    "hm_sfm.types": (
+        "ImagePair", "IndexMatches", "Keypoints", "MappingResult", "PairMatches", "PatchMatches", "Tracks",
+    ),
+}  # fmt: skip
+"""The imports above, for those that are made at run time. A test keeps the two equal."""
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first asked for: `hm-sfm --help` need not wait for PyTorch."""
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    """Import a public name when it is first used: `hm-sfm --help` need not wait for PyTorch."""
+    for module, names in _EXPORTS.items():
+        if name in names:
+            return getattr(import_module(module), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

@@ -1,11 +1,13 @@
 """Every command once, as a user types it. `reconstruct` and `demo` run in the fixtures."""
 
 import argparse
+import ast
 import json
 import shutil
 import subprocess
 import sys
 from importlib.metadata import entry_points, version
+from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -71,11 +73,20 @@ def test_help_does_not_wait_for_heavy_libraries():
 
 
 def test_every_public_name_is_importable():
-    assert {"HomoMatcher", "PairMatches", "reconstruct"} <= set(hm_sfm.__all__)
     for name in hm_sfm.__all__:
         assert getattr(hm_sfm, name).__name__ == name
     with pytest.raises(AttributeError, match="nothing"):
-        hm_sfm.nothing
+        hm_sfm.nothing  # noqa: B018
+
+
+def test_a_type_checker_sees_the_names_that_are_imported_at_run_time():
+    tree = ast.parse(Path(hm_sfm.__file__).read_text())
+    (checked,) = (node for node in tree.body if isinstance(node, ast.If))
+    imports = {line.module: tuple(alias.name for alias in line.names) for line in checked.body}
+    assert imports == hm_sfm._EXPORTS
+    assert sorted(name for names in imports.values() for name in names) == sorted(hm_sfm.__all__)
+    assert set(hm_sfm.__all__) <= set(dir(hm_sfm))
+    assert (Path(hm_sfm.__file__).parent / "py.typed").exists()
 
 
 def test_match_stops_after_the_matches(scene, tmp_path, run, read_matches):

@@ -1,4 +1,10 @@
-# make demo: set everything up and reconstruct a rendered scene.  make test: set everything up and run the tests.
+# Each target sets everything up first.
+#   make demo       reconstruct a rendered scene
+#   make check      style, imports and types
+#   make test-fast  the tests that are not slow, on all cores: before each commit
+#   make test       all tests
+#   make test-lowest  the fast tests and the demo with the lowest versions that pyproject.toml admits (downloads GBs)
+#   make docs       docs/api.md, the reference of the Python API, from the docstrings
 
 PYTHON ?= python3
 VENV := .venv
@@ -6,15 +12,27 @@ VENV := .venv
 TORCH := $(shell command -v nvidia-smi >/dev/null 2>&1 && echo "torch" \
 	|| echo "torch==2.13.0 --extra-index-url https://download.pytorch.org/whl/cpu")
 
-.PHONY: demo test docs setup
+.PHONY: check demo docs setup test test-fast test-lowest
 
 demo: setup
 	$(VENV)/bin/hm-sfm demo out/demo
 
+check: setup
+	$(VENV)/bin/ruff check
+	$(VENV)/bin/ruff format --check
+	$(VENV)/bin/lint-imports
+	$(VENV)/bin/pyright --pythonpath $(VENV)/bin/python
+
+# One thread a process: the threads of two would wait for each other.
+test-fast: setup
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -m "not slow" --numprocesses auto
+
 test: setup
 	$(VENV)/bin/python -m pytest
 
-# The reference of the Python API, docs/api.md, from the docstrings.
+test-lowest:
+	PYTHON=$(PYTHON) .ci/lowest_versions
+
 docs: setup
 	$(VENV)/bin/python docs/make_api_reference.py
 
@@ -23,5 +41,5 @@ setup: $(VENV)/installed
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/pip install --quiet --retries 1 $(TORCH)
-	$(VENV)/bin/pip install --quiet --editable ".[test,viz]"
+	$(VENV)/bin/pip install --quiet --editable ".[test,viz,dev]"
 	touch $@

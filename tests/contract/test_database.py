@@ -70,7 +70,7 @@ def test_jpeg_keeps_the_channel_order_and_leaves_no_other_file(tmp_path):
     ],
 )
 def test_jpeg_refuses_what_it_cannot_hold(tmp_path, image, focal_35mm, orientation):
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="must"):
         write_jpeg(tmp_path / "a.jpg", image, focal_35mm, orientation)
     assert not list(tmp_path.iterdir())
 

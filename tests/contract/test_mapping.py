@@ -1,4 +1,4 @@
-"""What hm_sfm.colmap.mapping makes of oracle scenes: cameras, points and keypoints known, matches exact or planted wrong."""
+"""What hm_sfm.colmap.mapping makes of oracle scenes: cameras, points and keypoints known, matches exact or wrong."""
 
 import shutil
 import signal
@@ -209,10 +209,10 @@ def test_missing_database_is_an_input_error(tmp_path):
 KILLED_MAPPING = """
 import os, signal, sys
 from pathlib import Path
-import hm_sfm.colmap.mapping
+from hm_sfm.colmap import mapping
 from hm_sfm.config import MappingConfig
 
-hm_sfm.colmap.mapping.SNAPSHOT_IMAGES = 3
+mapping.SNAPSHOT_IMAGES = 3
 registered = []
 
 def kill_at_nine():
@@ -221,7 +221,7 @@ def kill_at_nine():
         os.kill(os.getpid(), signal.SIGKILL)
 
 folder = Path(sys.argv[1])
-hm_sfm.colmap.mapping.map_incrementally(folder / "database.db", folder, folder / "sparse", MappingConfig(), True, kill_at_nine)
+mapping.map_incrementally(folder / "database.db", folder, folder / "sparse", MappingConfig(), True, kill_at_nine)
 """
 
 

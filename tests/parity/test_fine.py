@@ -77,7 +77,9 @@ def test_pooled_cells_sit_where_the_head_samples_them():
     assert pooled.tolist() == [2 * k + 0.5 for k in range(4)]
 
 
-@pytest.mark.parametrize("window, radius, spacing, margin", [(5, 1, 1, 0), (9, 1, 2, 2), (9, 3, 1, 2), (9, 0, 4, 1)])
+@pytest.mark.parametrize(
+    ("window", "radius", "spacing", "margin"), [(5, 1, 1, 0), (9, 1, 2, 2), (9, 3, 1, 2), (9, 0, 4, 1)]
+)
 def test_the_first_look_is_a_look_up_of_what_has_not_moved(window, radius, spacing, margin, generator):
     head = HomographyHead(window, radius, 1, margin, spacing)
     side, points = window + 2 * margin, len(head.grid)
@@ -98,7 +100,7 @@ def test_to_start_from_no_displacement_is_to_start_from_nothing(spacing, generat
         torch.testing.assert_close(vars(found), vars(expected), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("side, stride, pad", [(3, 1, 1), (3, 2, 1), (2, 1, 0), (3, 1, 0)])
+@pytest.mark.parametrize(("side", "stride", "pad"), [(3, 1, 1), (3, 2, 1), (2, 1, 0), (3, 1, 0)])
 def test_convolutions_are_the_same_without_gradients(side, stride, pad, generator):
     torch.manual_seed(0)
     layer = torch.nn.Conv2d(6, 4, side, stride=stride, padding=pad)

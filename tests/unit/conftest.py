@@ -44,7 +44,7 @@ def one_thread():
 
 @pytest.fixture
 def training(tmp_path, one_thread, monkeypatch) -> TrainConfig:
-    """Six steps of one pair, validated on four pairs after every third one, saved after each; pictures take too long."""
+    """Six steps of one pair, validated on four pairs after every third one, saved after each; no pictures."""
     monkeypatch.setattr(loop, "HELD_OUT_PAIRS", 4)
     monkeypatch.setattr(loop, "draw_curves", lambda log, validation, path: path.touch())
     (tmp_path / "photos").mkdir()

@@ -235,7 +235,7 @@ def test_a_missing_package_says_how_to_install_it(name, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "settings, words",
+    ("settings", "words"),
     [
         ({"coarse": "superglue"}, "light, sift, lightglue, xfeat or a file of weights, found 'superglue'"),
         ({"coarse": "sift", "coarse_matches": "a.h5"}, "choose one"),
@@ -368,7 +368,7 @@ def test_indices_into_keypoints_of_hloc(hloc_files):
 
 
 @pytest.mark.parametrize(
-    "arrays, words",
+    ("arrays", "words"),
     [
         ({"keypoints0": [[np.nan, 1], [2, 3]]}, "not finite"),
         ({"scores": [np.inf, 1]}, "not finite"),

@@ -63,7 +63,7 @@ def test_an_empty_file_is_the_default(tmp_path, text):
 
 
 @pytest.mark.parametrize(
-    "text, unknown, near",
+    ("text", "unknown", "near"),
     [
         ("keypoint: {}", "'keypoint'", "'keypoints'"),
         ("keypoints: {seperation_px: 2.0}", "'seperation_px'", "'separation_px'"),
@@ -121,7 +121,7 @@ def test_settings_that_are_one_of_a_few_words():
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("section, key, allowed", WORDS)
+@pytest.mark.parametrize(("section", "key", "allowed"), WORDS)
 def test_a_word_that_is_not_allowed_is_refused_and_the_allowed_ones_named(section, key, allowed, tmp_path):
     words = f"{', '.join(allowed[:-1])} or {allowed[-1]}"
     sentence = f"{section}.{key} must be {words}, found 'heavy'"
@@ -151,7 +151,7 @@ RENAMED_KEYS = [
 ]
 
 
-@pytest.mark.parametrize("section, old, new", RENAMED_KEYS)
+@pytest.mark.parametrize(("section", "old", "new"), RENAMED_KEYS)
 def test_a_key_of_the_last_version_is_refused_and_the_new_one_named(section, old, new, tmp_path):
     path = write(tmp_path / "old.yaml", f"{section}: {{{old}: 1}}")
     with pytest.raises(ConfigError, match=f"old.yaml: the key '{section}.{old}' is now called {new}"):
@@ -219,7 +219,7 @@ def test_parsing_a_written_out_configuration_gives_it_back():
     assert parse_config(dataclasses.asdict(config), Config) == config
 
 
-@pytest.mark.parametrize("name, value", leaves(Config()), ids=lambda part: part if isinstance(part, str) else "")
+@pytest.mark.parametrize(("name", "value"), leaves(Config()), ids=lambda part: part if isinstance(part, str) else "")
 def test_the_fingerprint_changes_with_any_value(name, value):
     section, key = name.split(".")
     other = {str: "other", int: 4711, float: 0.4711, bool: not value}[type(value)]

@@ -63,7 +63,7 @@ def test_a_failing_picture_leaves_the_earlier_one(files, monkeypatch):
         raise OSError("no space left")
 
     monkeypatch.setattr(Figure, "savefig", fail)
-    with pytest.raises(OSError):
+    with pytest.raises(OSError, match="no space left"):
         draw_curves(*files)
     assert files[2].read_bytes() == before
     assert sorted(p.name for p in files[2].parent.iterdir()) == ["curves.png", "log.csv"]

@@ -65,7 +65,7 @@ def test_a_pixel_lights_fine_cells_around_it():
     assert find_centroid(fine[0, 0], FINE) == pytest.approx((31.0, 25.0))
 
 
-@pytest.mark.parametrize("level, stride", [("quarter", 4), ("eighth", 8)])
+@pytest.mark.parametrize(("level", "stride"), [("quarter", 4), ("eighth", 8)])
 def test_context_lands_on_the_fine_cells_of_its_place(level, stride):
     branch = make_averaging(FineBranch())
     maps = {"quarter": torch.zeros(1, 24, 32, 32), "eighth": torch.zeros(1, 64, 16, 16)}

@@ -27,7 +27,7 @@ def make_cells(size: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    "window, radius, iterations, margin, spacing",
+    ("window", "radius", "iterations", "margin", "spacing"),
     [(9, 1, 3, 2, 1), (5, 1, 1, 0, 1), (17, 3, 2, 0, 1), (9, 1, 2, 2, 2), (9, 0, 1, 2, 4), (5, 1, 1, 2, 2)],
 )
 def test_homography_head_gives_one_estimate_per_iteration(window, radius, iterations, margin, spacing):
@@ -85,7 +85,7 @@ def test_expectation_head_is_unsure_of_a_flat_patch():
 
 @pytest.mark.parametrize("head", ["homography", "expectation"])
 @pytest.mark.parametrize(
-    "field, value",
+    ("field", "value"),
     [
         ("window", 8), ("window", 3), ("radius", -1), ("iterations", 0), ("margin", -1), ("spacing", 0),
         ("spacing", 3), ("spacing", 8),

@@ -229,14 +229,14 @@ def test_hidden_points_are_found_by_depth_alone(folders):
     assert (surface >= 0)[shown == 1].mean() > 0.5 and (unhidden >= 0)[shown == 1].mean() < 0.01
 
 
-@pytest.mark.parametrize("factor, kept", [(1.005, True), (0.97, False), (1.03, False), (0.0, False)])
+@pytest.mark.parametrize(("factor", "kept"), [(1.005, True), (0.97, False), (1.03, False), (0.0, False)])
 def test_depths_must_agree(folders, factor, kept):
     view_a, view_b = read_views(folders, (0, 0))
     _, surface = relate_depths(view_a, dataclasses.replace(view_b, depth=view_b.depth * np.float32(factor)), SIZE_WH)
     assert (surface >= 0).any() == kept
 
 
-@pytest.mark.parametrize("baseline, kept", [(0.5, True), (2.0, False)])
+@pytest.mark.parametrize(("baseline", "kept"), [(0.5, True), (2.0, False)])
 def test_the_same_error_of_depth_counts_more_where_there_is_more_parallax(baseline, kept):
     """At 5 m and 290 px, an error of 1.5 % moves a point by 0.43 px over half a metre, by 1.7 px over two."""
     depth, grey = np.full((240, 320), 5, np.float32), np.zeros((240, 320), np.float32)
@@ -349,7 +349,7 @@ def test_patches_are_supervised_by_the_blocks(folders):
 
 
 @pytest.mark.parametrize(
-    "overlap, expected",
+    ("overlap", "expected"),
     [
         (OverlapRange(), [{(0, 1), (0, 2)}, {(1, 2)}]),
         (OverlapRange(0.0, 1.0), [{(0, 1), (1, 2), (0, 2)}, {(1, 2), (0, 1)}]),
@@ -393,7 +393,7 @@ def put_nan(poses):
 
 
 @pytest.mark.parametrize(
-    "damage, message",
+    ("damage", "message"),
     [
         (lambda path: path.write_bytes(b"no archive"), "cannot read the scene_info file .*0000_0.1_0.3.npz"),
         (lambda path: path.write_bytes(b""), "cannot read the scene_info file .*0000_0.1_0.3.npz"),
@@ -438,7 +438,7 @@ def write_depth(path: Path, name: str, value) -> None:
 
 
 @pytest.mark.parametrize(
-    "name, damage, message",
+    ("name", "damage", "message"),
     [
         ("1.h5", lambda path: path.write_bytes(path.read_bytes()[:500]), "cannot read the depth map .*1.h5"),
         ("1.h5", lambda path: write_depth(path, "other", np.ones((240, 320))), "cannot read the depth map .*1.h5"),

@@ -111,7 +111,7 @@ def test_files_with_code_are_not_run(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "field, value", [("window", 17), ("radius", 3), ("margin", 0), ("head", "expectation"), ("backbone", "loftr")]
+    ("field", "value"), [("window", 17), ("radius", 3), ("margin", 0), ("head", "expectation"), ("backbone", "loftr")]
 )
 def test_weights_of_another_network_are_refused_and_the_field_is_named(field, value):
     network = NetworkConfig(**{field: value})

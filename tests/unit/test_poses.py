@@ -17,7 +17,8 @@ def make_rotation(axis, angle_deg):
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def make_view(center, rotation=np.eye(3)):
+def make_view(center, rotation=None):
+    rotation = np.eye(3) if rotation is None else rotation
     return PinholeView(K, (640, 480), np.column_stack([rotation, -rotation @ np.asarray(center, float)]))
 
 

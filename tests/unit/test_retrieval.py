@@ -274,7 +274,7 @@ def test_a_thousand_photos_need_few_pairs(monkeypatch, tmp_path):
     assert len(pairs) < 0.03 * 1000 * 999 / 2
 
 
-@pytest.mark.parametrize("backbone, coarse", [("light", "attention"), ("light", "cosine"), ("loftr", "attention")])
+@pytest.mark.parametrize(("backbone", "coarse"), [("light", "attention"), ("light", "cosine"), ("loftr", "attention")])
 def test_plain_features_are_those_that_the_coarse_stage_starts_from(backbone, coarse):
     torch.manual_seed(0)
     net = HomoNet(NetworkConfig(backbone=backbone, coarse=coarse))

@@ -144,7 +144,7 @@ def test_a_crash_while_merging_loses_nothing(tmp_path, batch, monkeypatch):
 
 @pytest.mark.parametrize("merged", [False, True])
 @pytest.mark.parametrize(
-    "changed, key, found, wanted",
+    ("changed", "key", "found", "wanted"),
     [
         ({"matching.max_matches": 100}, "matching.max_matches", "8000", "100"),
         ({"weights": "xyz"}, "weights", "'abc'", "'xyz'"),

@@ -38,7 +38,7 @@ def test_strecha_files_round_trip(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text, reason",
+    ("text", "reason"),
     [
         ("", "26 finite numbers"),
         (CAMERA_FILE.replace("640 480", "640"), "26 finite numbers"),

@@ -1,5 +1,7 @@
 """Tracks from matches: merges, conflicts, and one keypoint per image."""
 
+from itertools import pairwise
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -45,7 +47,7 @@ def test_two_matches_that_share_a_keypoint_merge():
 
 def test_a_long_chain_is_one_track_whatever_its_direction():
     chain = np.random.default_rng(0).permutation(200)
-    labels = label(200, list(zip(chain[:-1], chain[1:])), np.ones(199), np.arange(200))
+    labels = label(200, list(pairwise(chain)), np.ones(199), np.arange(200))
     assert len(np.unique(labels)) == 1
 
 

@@ -421,7 +421,9 @@ def test_a_folder_with_a_training_is_not_overwritten(training):
     ("spoil", "message"),
     [
         pytest.param(lambda content: None, "is damaged", id="text"),
-        pytest.param(lambda content: {"state_dict": {}}, "lacks fingerprint, step, net, average, optimizer", id="weights"),
+        pytest.param(
+            lambda content: {"state_dict": {}}, "lacks fingerprint, step, net, average, optimizer", id="weights"
+        ),
         pytest.param(
             lambda content: content | {"net": {"head.x": torch.zeros(2)} | dict(list(content["net"].items())[1:])},
             "missing: backbone.trunk.skip1.1.weight; unexpected: head.x$",

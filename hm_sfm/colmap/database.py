@@ -13,10 +13,11 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import pycolmap
 
-from hm_sfm.colmap.models import find_known, quiet_colmap
+from hm_sfm.colmap.models import find_known
 from hm_sfm.colmap.rigs import assign_cameras, read_rigs
 from hm_sfm.config import CameraConfig
 from hm_sfm.errors import ConfigError, InputError
+from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.photos.bitmaps import read_bitmap
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 

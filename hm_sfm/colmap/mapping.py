@@ -17,11 +17,11 @@ import numpy as np
 import pycolmap
 
 from hm_sfm.colmap.database import Cameras, open_database
-from hm_sfm.colmap.models import quiet_colmap
 from hm_sfm.colmap.rigs import lack_poses
 from hm_sfm.colmap.snapshots import SNAPSHOT_FOLDER, Snapshots, digest_inputs
 from hm_sfm.config import MappingConfig
 from hm_sfm.errors import ConfigError
+from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.photos.bitmaps import open_to_colmap
 from hm_sfm.types import ImageRef, MappingResult
 

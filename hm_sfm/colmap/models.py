@@ -2,14 +2,14 @@
 
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from hm_sfm.errors import InputError
+from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.keypoints.tracks import build_tracks
 from hm_sfm.types import ImageRef, Tracks
 
@@ -18,17 +18,6 @@ REQUIRED = ("cameras", "images")
 OPTIONAL = ("rigs", "frames", "points3D")
 NO_POINTS = {".bin": bytes(8), ".txt": b""}
 """A points3D file without points: people who know their cameras often have none."""
-
-
-@contextmanager
-def quiet_colmap(level: pycolmap.logging.Level = pycolmap.logging.WARNING) -> Iterator[None]:
-    """Keep COLMAP's messages below `level` off stderr."""
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(before, int(level))
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = before
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:

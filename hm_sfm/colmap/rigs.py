@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from hm_sfm.colmap.models import quiet_colmap
 from hm_sfm.config import parse_config
 from hm_sfm.errors import InputError
+from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.types import ImagePair
 
 UNIT_TOLERANCE = 0.01

@@ -13,8 +13,8 @@ import pycolmap
 from tqdm import tqdm
 
 from hm_sfm.colmap.database import open_database
-from hm_sfm.colmap.models import quiet_colmap
 from hm_sfm.config import VerificationConfig
+from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.types import ImagePair, ImageRef, PairMatches, freeze_array
 
 # Fewer matches than this prove nothing about an epipolar geometry.

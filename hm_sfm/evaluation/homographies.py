@@ -13,7 +13,8 @@ from tqdm import tqdm
 from hm_sfm.errors import InputError
 from hm_sfm.evaluation.poses import pose_auc
 from hm_sfm.geometry.frames import homography_from_pixel_index
-from hm_sfm.matching.matcher import HomoMatcher, ImageFeatures
+from hm_sfm.matching.interfaces import ImageFeatures
+from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.photos.images import prepare_image, read_ref
 from hm_sfm.types import PatchMatches
 

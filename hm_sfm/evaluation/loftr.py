@@ -1,6 +1,5 @@
 """LoFTR itself, through kornia, with a checkpoint that the user has: a matcher to compare with."""
 
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +9,10 @@ from torch import Tensor
 
 from hm_sfm.config import ImageConfig, MatchingConfig
 from hm_sfm.errors import MissingPackageError
-from hm_sfm.matching.matcher import digest_weights, fit_state, is_inside, pad_image, pick_device, read_checkpoint
+from hm_sfm.matching.encoder import pad_image
+from hm_sfm.matching.patches import is_inside
+from hm_sfm.network.checkpoints import digest_weights, fit_state, read_checkpoint
+from hm_sfm.network.device import pick_device
 from hm_sfm.photos.images import PreparedImage
 from hm_sfm.types import PatchMatches
 
@@ -48,8 +50,8 @@ class LoftrMatcher:
             raise MissingPackageError(
                 "LoFTR's own matches need the package kornia, which is not installed: pip install kornia"
             ) from error
-        # LoFTR is compared as it is: photos are not matched again in other ways.
-        self.config, self.images = dataclasses.replace(config, try_hypotheses=False), images
+        self.config, self.images = config, images
+        self.cell_matcher = None  # LoFTR is compared as it is: no rotation or scale hypotheses
         self.made_by = {
             "weights": digest_weights(str(checkpoint)),
             "kornia": kornia.__version__,
@@ -81,7 +83,10 @@ class LoftrMatcher:
         xy0 = found["keypoints0"].double().cpu().numpy() @ stored0[:2, :2].T + stored0[:2, 2]
         xy1 = found["keypoints1"].double().cpu().numpy() @ stored1[:2, :2].T + stored1[:2, 2]
         score = found["confidence"].float().cpu().numpy()
-        inside = np.flatnonzero(is_inside(xy0, image0) & is_inside(xy1, image1))
+        inside0, inside1 = (
+            is_inside(xy, image.scaled_wh, image.stored_from_scaled) for xy, image in ((xy0, image0), (xy1, image1))
+        )
+        inside = np.flatnonzero(inside0 & inside1)
         best = inside[np.argsort(-score[inside], kind="stable")][: self.config.max_matches]
         shift = np.tile(np.eye(3), (len(best), 1, 1))
         shift[:, :2, 2] = xy1[best] - xy0[best]

@@ -20,11 +20,12 @@ import numpy as np
 import pycolmap
 
 from hm_sfm.colmap.database import open_database
-from hm_sfm.colmap.models import quiet_colmap, read_model
+from hm_sfm.colmap.models import read_model
 from hm_sfm.errors import InputError
 from hm_sfm.formats.hloc import write_features, write_matches
 from hm_sfm.formats.pairs_files import read_pairs, write_pairs
 from hm_sfm.io.atomic import make_folder, replace_file
+from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.photos.bitmaps import FOREIGN_EXTENSIONS
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 

@@ -27,6 +27,10 @@ class Grid:
         """Px of the network's input image (..., any) -> real-valued cell indices."""
         return (xy_px - self.offset) / self.stride
 
+    def count_cells(self, size_px: int) -> int:
+        """Cells along an axis whose centre lies within `size_px`."""
+        return int(np.ceil((size_px - self.offset) / self.stride))
+
 
 def px_from_pixel_index(index: Array) -> Array:
     """OpenCV's indices (..., 2), where pixel centres are integers -> COLMAP px."""

@@ -8,26 +8,14 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from hm_sfm.matching.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
-from hm_sfm.matching.matcher import (
-    HomoMatcher,
-    autocast,
-    cell_to_px,
-    computes_in_half,
-    make_start,
-    pad_image,
-    round_to_cells,
-    score_from_scale,
-)
-from hm_sfm.network.fine import FineMap, make_fine_map
-from hm_sfm.network.homography import is_regular
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.matching.patches import estimate_patches, locate_patches, make_start, round_to_cells
+from hm_sfm.network.device import computes_in_half
+from hm_sfm.network.fine import FineMap
+from hm_sfm.photos.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
 from hm_sfm.photos.images import PreparedImage, prepare_image
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
-STRIP_PX = 1024
-"""Large photos are encoded in strips of so many rows, to bound the memory,"""
-MARGIN_PX = 128
-"""with so many more on each side as the network looks around. Both are multiples of any backbone's stride."""
 ITERATIONS = 1
 """Updates of the homographies, which start close to the result: a second one changes nothing that can be measured."""
 
@@ -116,23 +104,12 @@ def fit_hypotheses(linear: np.ndarray) -> tuple[Hypothesis, Hypothesis]:
     return Hypothesis(downscale=2 ** max(0, -octaves)), Hypothesis(rotation_deg, 2 ** max(0, octaves))
 
 
-@torch.inference_mode()
 def encode_for_refinement(
     matcher: HomoMatcher, image: PreparedImage, hypothesis: Hypothesis = IDENTITY
 ) -> RefinementFeatures:
-    """The fine features of a photo, strip by strip: what the backbone makes of the whole, but for the last digits."""
+    """The fine features of a photo."""
     image = apply_hypothesis(image, hypothesis)
-    backbone = matcher.net.backbone
-    pixels = pad_image(torch.tensor(image.grey, device=matcher.device), backbone.stride, backbone.standardised)
-    stride, height = backbone.fine_grid.stride, pixels.shape[2]
-    strips = []
-    for top in range(0, height, STRIP_PX):
-        first, last = max(0, top - MARGIN_PX), min(height, top + STRIP_PX + MARGIN_PX)
-        with autocast(matcher.device):
-            fine = backbone(pixels[:, :, first:last]).fine
-        bottom = min(height, top + STRIP_PX)
-        strips.append(fine[:, :, (top - first) // stride : (bottom - first) // stride])
-    return RefinementFeatures(make_fine_map(torch.cat(strips, dim=2)), image.stored_from_scaled, hypothesis.downscale)
+    return RefinementFeatures(matcher.encoder.encode_fine(image), image.stored_from_scaled, hypothesis.downscale)
 
 
 @torch.inference_mode()
@@ -150,27 +127,22 @@ def estimate_pair(
         xy @ scaled[:2, :2].T + scaled[:2, 2] for xy, scaled in ((placement.xy0, scaled0), (placement.xy1, scaled1))
     )
     linear = relate_inputs(features0, features1, placement)
-    cell0, rest0 = round_to_cells(xy0, grid)
-    cell1, rest1 = round_to_cells(xy1, grid)
-    start = make_start(rest0, rest1, linear, head.half).to(matcher.device)
+    cell0, offset0 = round_to_cells(xy0, grid)
+    cell1, offset1 = round_to_cells(xy1, grid)
+    start = make_start(offset0, offset1, linear, head.half).to(matcher.device)
     cells = cell0.to(matcher.device), cell1.to(matcher.device)
-    homography, log_scale = matcher.estimate_patches(features0.fine, features1.fine, *cells, start, ITERATIONS)
-    regular = is_regular(homography, head.half).cpu().numpy()
-
-    stored0 = features0.stored_from_scaled @ cell_to_px(cell0.numpy(), grid)
-    stored1 = features1.stored_from_scaled @ cell_to_px(cell1.numpy(), grid)
-    between = stored1 @ homography.cpu().numpy().astype(np.float64) @ np.linalg.inv(stored0)
-    between[~regular] = np.eye(3)
-    at = np.einsum("nij,nj->ni", between, np.concatenate([placement.xy0, np.ones((len(between), 1))], axis=1))
-    score = score_from_scale(log_scale.cpu().numpy().astype(np.float64), grid)
+    estimates = estimate_patches(head, features0.fine, features1.fine, *cells, start, ITERATIONS)
+    patches = locate_patches(
+        estimates, offset0, features0.stored_from_scaled, features1.stored_from_scaled, grid, head.half
+    )
+    score = patches.score
     if features1.downscale > 1:  # a px of the photo at `long_edge_px` is less than one of the reduced input
         score = 1 - (1 - score) ** (1 / features1.downscale)
-    px_per_cell = np.sqrt(abs(np.linalg.det(features0.stored_from_scaled[:2, :2]))) * grid.stride
     return PairMatches(
         pair=pair,
         xy0=placement.xy0,
-        xy1=at[:, :2] / at[:, 2:],
-        score=np.where(regular, score, 0.0),
-        homography=between / at[:, 2, None, None],
-        patch_radius_px=float(head.half * px_per_cell),
+        xy1=patches.xy1,
+        score=np.where(patches.regular, score, 0.0),
+        homography=patches.homography,
+        patch_radius_px=patches.patch_radius_px,
     )

@@ -1,99 +1,67 @@
-"""Photos turned or reduced, for pairs that match badly as they are: on their side, upside down, or of another scale.
+"""Rotation and scale hypotheses, for pairs that match badly as they are: a photo on its side, or of another scale.
 
-The network's features know what is up and how large things are. So where two photos have few good matches, small
-sketches of them are compared, one turned by quarters and either one reduced; where one way stands out, the photos are
-matched again that way. Patches are upright and of one scale then: their homographies start from the relative turn and
-scale, not from the identity. The points are those of the stored photos all the same.
+The network's features depend on rotation and scale. So where two photos have few good matches, small sketches of them
+are compared, one rotated by quarter turns and either one reduced. Where one hypothesis stands out, the photos are
+matched again under it. Patches are then upright and of one scale: their homographies start from the relative rotation
+and scale, not from the identity. The points are still those of the stored photos.
 """
 
-import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
-import cv2
 import numpy as np
 from torch import Tensor
 
-from hm_sfm.geometry.frames import rotation_matrix
-from hm_sfm.photos.images import CV_ROTATIONS, PreparedImage
+from hm_sfm.matching.interfaces import CellMatcher, PairMatcher
+from hm_sfm.photos.hypotheses import IDENTITY, ROTATIONS_DEG, Hypothesis, apply_hypothesis
+from hm_sfm.photos.images import PreparedImage
 from hm_sfm.types import PatchMatches
 
-if TYPE_CHECKING:
-    from hm_sfm.matching.matcher import HomoMatcher, ImageFeatures
-
 GOOD_SCORE = 0.5
-"""As in VerificationConfig.min_score."""
+"""A match with at least this score, the probability of an error below 1 px, is a good one."""
 FEW_MATCHES = 500
-"""Pairs with fewer good matches are compared as sketches: of turned photos, a few hundred can be good by chance."""
+"""Pairs with fewer good matches are compared as sketches: of rotated photos, a few hundred can be good by chance."""
 SKETCH_LONG_EDGE_PX = 384
-ROTATIONS_DEG = (0, *CV_ROTATIONS)
 DOWNSCALES = (2, 3)
 MIN_DOWNSCALE = 1.4
-"""What differs less in scale is matched as it is."""
+"""Smaller differences in scale are left as they are."""
 NEAR_CELLS = 3
-"""Matches of two sketches agree with others so far away, along each axis,"""
+"""Cells, along each axis, within which the other matches of two sketches are neighbours of a match."""
 LEAST_SUPPORT = 8
-"""if so many of them,"""
+"""A match agrees with its neighbours where at least so many of them,"""
 LEAST_SHARE = 0.5
-"""and this part of them, are matched side by side in the other sketch, too."""
+"""and at least this share of them, lie beside it in the other sketch, too."""
 ENOUGH_AGREEING = 40
-"""Where turned ones have so many matches that agree, other scales are not looked at."""
+"""Where a rotation has so many agreeing matches, other scales are not compared."""
 LEAST_AGREEING = 30
-"""Photos are matched again where another way has so many, photos of different places having up to 16 in some way,"""
+"""Photos are matched again under a hypothesis with so many agreeing matches (different places have up to 16),"""
 LEAST_GAIN = 2.0
-"""and so many times as many as the photos as they are."""
+"""and with so many times as many as the photos as they are."""
 
+HypothesisPair = tuple[Hypothesis, Hypothesis]
+"""How photo 0 and photo 1 are encoded."""
 
-@dataclass(frozen=True)
-class Hypothesis:
-    """How a prepared photo is shown to the network."""
-
-    rotation_deg: int = 0
-    """Clockwise: 0, 90, 180 or 270."""
-    downscale: float = 1
-    """By how much it is smaller along both axes."""
-
-
-IDENTITY = Hypothesis()
 UNCHANGED = (IDENTITY, IDENTITY)
-ROTATIONS = tuple((IDENTITY, Hypothesis(rotation_deg)) for rotation_deg in ROTATIONS_DEG)
-"""Variants of photo 0 and photo 1 that are compared first,"""
-SCALES = tuple(
-    way
+ROTATIONS: tuple[HypothesisPair, ...] = tuple((IDENTITY, Hypothesis(rotation_deg)) for rotation_deg in ROTATIONS_DEG)
+"""Compared first,"""
+SCALES: tuple[HypothesisPair, ...] = tuple(
+    hypotheses
     for downscale in DOWNSCALES
     for rotation_deg in ROTATIONS_DEG
-    for way in (
+    for hypotheses in (
         (IDENTITY, Hypothesis(rotation_deg, downscale)),
         (Hypothesis(downscale=downscale), Hypothesis(rotation_deg)),
     )
 )
-"""and after them."""
-
-
-def apply_hypothesis(image: PreparedImage, hypothesis: Hypothesis) -> PreparedImage:
-    """The image turned and reduced; its points map back to px of the same stored photo."""
-    if hypothesis == IDENTITY:
-        return image
-    width, height = image.scaled_wh
-    reduced_wh = tuple(max(1, round(size / hypothesis.downscale)) for size in image.scaled_wh)
-    grey = cv2.resize(image.grey, reduced_wh, interpolation=cv2.INTER_AREA)
-    if hypothesis.rotation_deg:
-        grey = cv2.rotate(grey, CV_ROTATIONS[hypothesis.rotation_deg])
-    scaled_wh = (grey.shape[1], grey.shape[0])
-    scaled_from_reduced = np.diag([width / reduced_wh[0], height / reduced_wh[1], 1.0])
-    reduced_from_turned = rotation_matrix(scaled_wh, -hypothesis.rotation_deg % 360)
-    # Providers of coarse matches that read the photo themselves turn it as its reference says.
-    ref = dataclasses.replace(image.ref, rotation_deg=(image.ref.rotation_deg + hypothesis.rotation_deg) % 360)
-    return PreparedImage(ref, grey, scaled_wh, image.stored_from_scaled @ scaled_from_reduced @ reduced_from_turned)
+"""and these after them."""
 
 
 class Sketch:
-    """The coarse features of one photo at a small size, by hypothesis, made as they are asked for."""
+    """One photo at a small size, and its coarse cells under each hypothesis that was asked for."""
 
-    def __init__(self, matcher: "HomoMatcher", image: PreparedImage) -> None:
+    def __init__(self, image: PreparedImage) -> None:
         self.downscale = max(1.0, max(image.scaled_wh) / SKETCH_LONG_EDGE_PX)
-        self.matcher, self.image = matcher, apply_hypothesis(image, Hypothesis(downscale=self.downscale))
+        self.image = apply_hypothesis(image, Hypothesis(downscale=self.downscale))
         self.cells: dict[Hypothesis, Tensor] = {}
 
     @property
@@ -101,29 +69,30 @@ class Sketch:
         """Memory that it takes."""
         return self.image.grey.nbytes + sum(cells.nbytes for cells in self.cells.values())
 
-    def get(self, hypothesis: Hypothesis) -> Tensor:
-        """(H, W, C) float32, as HomoMatcher.encode_coarse makes them."""
+    def encode(self, hypothesis: Hypothesis, matcher: CellMatcher) -> Tensor:
+        """(H, W, C) float32: the cells under a hypothesis, encoded once."""
         if hypothesis not in self.cells:
-            self.cells[hypothesis] = self.matcher.encode_coarse(apply_hypothesis(self.image, hypothesis))
+            self.cells[hypothesis] = matcher.encode(apply_hypothesis(self.image, hypothesis))
         return self.cells[hypothesis]
 
 
-def choose_hypotheses(matcher: "HomoMatcher", sketch0: Sketch, sketch1: Sketch) -> tuple[Hypothesis, Hypothesis] | None:
-    """How to show two photos so that they match, or None where they do as they are, or no way stands out.
+def choose_hypotheses(matcher: CellMatcher, sketch0: Sketch, sketch1: Sketch) -> HypothesisPair | None:
+    """The hypotheses under which two photos match; None where they match as they are, or where none stands out.
 
-    Photo 0 is never turned, and at most one of the two is reduced. Of equally good ways the first one is taken: the one
-    that reduces or turns less.
+    Photo 0 is never rotated, and at most one of the two is reduced. Of equally good hypotheses the first one is taken:
+    the one that reduces or rotates less.
     """
 
     def count(hypothesis0: Hypothesis, hypothesis1: Hypothesis) -> int:
+        both = sketch0.encode(hypothesis0, matcher), sketch1.encode(hypothesis1, matcher)
         # The smaller sketch comes first: the matrix of similarities goes by its rows.
-        cells0, cells1 = sorted((sketch0.get(hypothesis0), sketch1.get(hypothesis1)), key=Tensor.numel)
-        index0, index1, _ = matcher.match_coarse(cells0, cells1)
+        cells0, cells1 = sorted(both, key=Tensor.numel)
+        index0, index1, _ = matcher.match(cells0, cells1)
         return count_agreeing(place_cells(index0, cells0.shape[1]), place_cells(index1, cells1.shape[1]))
 
-    counts = {way: count(*way) for way in ROTATIONS}
+    counts = {hypotheses: count(*hypotheses) for hypotheses in ROTATIONS}
     if max(counts.values()) < ENOUGH_AGREEING:
-        counts |= {way: count(*way) for way in SCALES}
+        counts |= {hypotheses: count(*hypotheses) for hypotheses in SCALES}
     best = max(counts, key=counts.__getitem__)
     needed = LEAST_AGREEING if best == UNCHANGED else max(LEAST_AGREEING, LEAST_GAIN * counts[UNCHANGED])
     if counts[best] < needed:
@@ -132,18 +101,16 @@ def choose_hypotheses(matcher: "HomoMatcher", sketch0: Sketch, sketch1: Sketch) 
     return None if chosen == UNCHANGED else chosen
 
 
-def relate_scales(
-    way: tuple[Hypothesis, Hypothesis], downscale0: float, downscale1: float
-) -> tuple[Hypothesis, Hypothesis]:
-    """Variants of two photos that have the turns and the relative scale of these hypotheses of their sketches.
+def relate_scales(hypotheses: HypothesisPair, downscale0: float, downscale1: float) -> HypothesisPair:
+    """The hypotheses of two photos that have the rotations and the relative scale of those of their sketches.
 
     downscale0, downscale1: of the sketches against the photos, which may be of different sizes.
     """
-    reductions = way[0].downscale * downscale0, way[1].downscale * downscale1
+    reductions = hypotheses[0].downscale * downscale0, hypotheses[1].downscale * downscale1
     factors = [downscale / min(reductions) for downscale in reductions]
     hypothesis0, hypothesis1 = (
         Hypothesis(hypothesis.rotation_deg, factor if factor >= MIN_DOWNSCALE else 1)
-        for hypothesis, factor in zip(way, factors)
+        for hypothesis, factor in zip(hypotheses, factors)
     )
     return hypothesis0, hypothesis1
 
@@ -154,9 +121,9 @@ def place_cells(index: np.ndarray, columns: int) -> np.ndarray:
 
 
 def count_agreeing(cell0: np.ndarray, cell1: np.ndarray) -> int:
-    """How many matches (M, 2) int16 of cells lie as the matches around them do, in both images.
+    """How many matches (M, 2) int16 of cells agree with the matches around them, in both images.
 
-    Of photos of different places hardly any do, nor of photos turned against each other.
+    Hardly any do in photos of different places, or in photos rotated against each other.
     """
     step0 = cell0[:, None] - cell0
     near = np.abs(step0).max(axis=2) <= NEAR_CELLS
@@ -167,19 +134,19 @@ def count_agreeing(cell0: np.ndarray, cell1: np.ndarray) -> int:
 
 
 def retry_hypotheses(
-    matcher: "HomoMatcher",
+    matcher: PairMatcher,
     first: PatchMatches,
-    encode: Callable[[int, Hypothesis], "ImageFeatures"],
+    encode: Callable[[int, Hypothesis], Any],
     sketch: Callable[[int], Sketch],
 ) -> PatchMatches:
-    """The matches of two photos: `first`, found in the photos as they are, or those found another way, if better.
+    """The better matches of two photos: `first`, of the photos as they are, or those under other hypotheses.
 
-    encode, sketch: give the features and the sketch of photo 0 or 1; called only where `first` has few good matches and
-    the configuration allows it. The result depends on nothing but the two photos.
+    encode, sketch: give the features under a hypothesis, and the sketch, of photo 0 or 1. They are called only where
+    `first` has few good matches and the matcher compares hypotheses. The result depends on nothing but the two photos.
     """
-    if not matcher.config.try_hypotheses or count_good(first) >= FEW_MATCHES:
+    if matcher.cell_matcher is None or count_good(first) >= FEW_MATCHES:
         return first
-    hypotheses = choose_hypotheses(matcher, sketch(0), sketch(1))
+    hypotheses = choose_hypotheses(matcher.cell_matcher, sketch(0), sketch(1))
     if hypotheses is None:
         return first
     second = matcher.match_features(*(encode(side, hypothesis) for side, hypothesis in enumerate(hypotheses)))
@@ -187,5 +154,5 @@ def retry_hypotheses(
 
 
 def count_good(matches: PatchMatches) -> int:
-    """How many have a good score."""
+    """How many have at least GOOD_SCORE."""
     return int(np.count_nonzero(matches.score >= GOOD_SCORE))

@@ -11,10 +11,12 @@ from tqdm import tqdm
 
 from hm_sfm.errors import ConfigError, MissingPackageError
 from hm_sfm.io.batches import store_in_batches
-from hm_sfm.matching.hypotheses import IDENTITY, Hypothesis, Sketch, apply_hypothesis, retry_hypotheses
-from hm_sfm.matching.matcher import HomoMatcher, ImageFeatures
+from hm_sfm.matching.hypotheses import Sketch, retry_hypotheses
+from hm_sfm.matching.interfaces import ImageFeatures
+from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.order import order_pairs
 from hm_sfm.matching.store import MatchStore
+from hm_sfm.photos.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
 from hm_sfm.photos.images import PreparedImage, prepare_image
 from hm_sfm.types import ImagePair, ImageRef, PairMatches, PatchMatches
 
@@ -43,7 +45,7 @@ class FeatureCache:
 
     def sketch(self, name: str) -> Sketch:
         """The sketch of a photo. Raises as get does."""
-        return self._keep(name, None, lambda image: Sketch(self.matcher, image))
+        return self._keep(name, None, Sketch)
 
     def _keep(
         self, name: str, hypothesis: Hypothesis | None, make: Callable[[PreparedImage], ImageFeatures | Sketch]

@@ -7,7 +7,7 @@ and go.
 """
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -18,9 +18,8 @@ from tqdm import tqdm
 from hm_sfm.config import fingerprint
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.io.batches import store_in_batches
-from hm_sfm.matching.hypotheses import ROTATIONS_DEG, Hypothesis, apply_hypothesis
-from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.photos.images import prepare_image
+from hm_sfm.photos.hypotheses import ROTATIONS_DEG, Hypothesis, apply_hypothesis
+from hm_sfm.photos.images import PreparedImage, prepare_image
 from hm_sfm.types import ImageRef
 
 logger = logging.getLogger(__name__)
@@ -38,6 +37,9 @@ CELLS_PER_WORD = 20
 """Fewer cells make fewer words."""
 BLOCK_ROWS = 512
 """Rows of the similarity matrix that are held at a time."""
+
+EncodeCells = Callable[[PreparedImage], np.ndarray]
+"""A photo -> (N, C) float32 of unit length: its cells as a network sees them, see Encoder.encode_plain."""
 
 
 class CellStore:
@@ -96,7 +98,7 @@ class CellStore:
 def describe_images(
     images: Sequence[ImageRef],
     digests: Mapping[str, str],
-    matcher: HomoMatcher,
+    encode: EncodeCells,
     store: CellStore,
     quiet: bool = False,
     turned: bool = False,
@@ -108,7 +110,7 @@ def describe_images(
     undecodable photo; what was stored by then stays.
     """
     turns_deg = ROTATIONS_DEG if turned else (0,)
-    encode_images(images, digests, matcher, store, quiet, turns_deg)
+    encode_images(images, digests, encode, store, quiet, turns_deg)
     keys = [name_sample(digests[image.name], rotation_deg) for rotation_deg in turns_deg for image in images]
     vocabulary = learn_vocabulary(store.read(keys, max(1, VOCABULARY_CELLS // len(keys))))
     described = weigh_words(np.stack([count_words(cells, vocabulary) for cells in store.read(keys)]))
@@ -118,7 +120,7 @@ def describe_images(
 def encode_images(
     images: Sequence[ImageRef],
     digests: Mapping[str, str],
-    matcher: HomoMatcher,
+    encode: EncodeCells,
     store: CellStore,
     quiet: bool = False,
     turns_deg: Sequence[int] = (0,),
@@ -135,7 +137,7 @@ def encode_images(
             for rotation_deg in turns_deg:
                 key = name_sample(digest, rotation_deg)
                 if key not in store:
-                    cells = matcher.encode_plain(apply_hypothesis(prepared, Hypothesis(rotation_deg))).cpu().numpy()
+                    cells = encode(apply_hypothesis(prepared, Hypothesis(rotation_deg)))
                     keep([(key, sample_cells(cells))])
 
 

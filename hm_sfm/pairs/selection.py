@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from hm_sfm.colmap.models import quiet_colmap
 from hm_sfm.config import PairConfig
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.formats.pairs_files import read_pairs
+from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.types import ImagePair
 
 logger = logging.getLogger(__name__)

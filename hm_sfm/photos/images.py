@@ -180,6 +180,17 @@ def prepare_array(array: np.ndarray, long_edge_px: int, name: str = "array") -> 
     return _prepare(ImageRef(name, Path(name), size_wh), grey, long_edge_px)
 
 
+def read_rgb(image: PreparedImage) -> np.ndarray:
+    """(H, W, 3) uint8 RGB of a prepared image, turned and reduced as it is; grey where there is no file to read."""
+    bitmap = read_bitmap(image.ref.path, as_rgb=True) if image.ref.path.is_file() else None
+    if bitmap is None or (bitmap.width, bitmap.height) != tuple(image.ref.size_wh):
+        return np.repeat(np.rint(image.grey * 255).astype(np.uint8)[:, :, None], 3, axis=2)
+    rgb = bitmap.to_array()
+    if image.ref.rotation_deg:
+        rgb = cv2.rotate(rgb, CV_ROTATIONS[image.ref.rotation_deg])
+    return cv2.resize(rgb, image.scaled_wh, interpolation=cv2.INTER_AREA)
+
+
 def _prepare(ref: ImageRef, stored: np.ndarray, long_edge_px: int) -> PreparedImage:
     """Reduce and turn a stored grey image, (H, W) uint8 or uint16."""
     if long_edge_px < MIN_EDGE_PX:

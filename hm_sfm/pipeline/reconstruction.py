@@ -31,11 +31,12 @@ from hm_sfm.keypoints.graph import Photo
 from hm_sfm.keypoints.persistence import persist_keypoints
 from hm_sfm.keypoints.refinement import KeypointRefiner
 from hm_sfm.keypoints.seeds import find_seeds
-from hm_sfm.matching.coarse_matches import check_coarse, describe_coarse
-from hm_sfm.matching.matcher import HomoMatcher, digest_weights
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.matching.providers.choice import check_coarse, describe_coarse
 from hm_sfm.matching.run import check_engine, match_pairs
 from hm_sfm.matching.shards import Shard, merge_shards, refuse_shards
 from hm_sfm.matching.store import MatchStore, digest_image
+from hm_sfm.network.checkpoints import digest_weights
 from hm_sfm.pairs.retrieval import CellStore, describe_images, find_similar
 from hm_sfm.pairs.selection import select_pairs
 from hm_sfm.photos.images import list_images, prepare_image
@@ -248,7 +249,9 @@ def choose_pairs(
         with wait_in_line(folder / ".lock"):  # other shards find the photos encoded
             store = CellStore(folder, digest_weights(config.matching.model))
             turned = config.matching.try_hypotheses
-            return find_similar(describe_images(photos, digests, matcher, store, quiet, turned), top, gap)
+            return find_similar(
+                describe_images(photos, digests, matcher.encoder.encode_plain, store, quiet, turned), top, gap
+            )
 
     positions = {image.name: image.gps for image in images if image.gps}
     names = [image.name for image in images]

@@ -15,15 +15,15 @@ import numpy as np
 import pycolmap
 
 from hm_sfm.colmap.database import Cameras, open_database, read_verified_matches
-from hm_sfm.colmap.models import quiet_colmap
 from hm_sfm.config import Config
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.formats.hloc import name_group
 from hm_sfm.geometry.frames import pixel_index_from_px
 from hm_sfm.io.atomic import replace_file
+from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.io.locks import release_locks
-from hm_sfm.matching.coarse_matches import check_coarse
 from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.matching.providers.choice import check_coarse
 from hm_sfm.matching.run import match_pairs
 from hm_sfm.photos.images import read_ref
 from hm_sfm.photos.masks import MaskedStore, read_masks

@@ -25,8 +25,9 @@ from tqdm import tqdm
 from hm_sfm.config import NetworkConfig, fingerprint
 from hm_sfm.errors import ConfigError, HmSfmError, MissingPackageError, WeightsError
 from hm_sfm.io.atomic import replace_file
-from hm_sfm.matching.matcher import HomoNet, fit_state, load_loftr, load_parts, read_checkpoint, save_weights
 from hm_sfm.network.backbone import load_xfeat
+from hm_sfm.network.checkpoints import fit_state, load_loftr, load_parts, read_checkpoint, save_weights
+from hm_sfm.network.homonet import HomoNet
 from hm_sfm.training.curves import draw_curves
 from hm_sfm.training.megadepth import MegaDepthPairs
 from hm_sfm.training.mixture import MixedPairs, collate_pairs

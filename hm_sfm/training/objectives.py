@@ -7,11 +7,11 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 from torch import Tensor
 
-from hm_sfm.matching.matcher import HomoNet
 from hm_sfm.network.aspan import Flow
 from hm_sfm.network.backbone import FeatureMaps
 from hm_sfm.network.coarse import AspanCoarse
 from hm_sfm.network.fine import FineEstimate, make_fine_map
+from hm_sfm.network.homonet import HomoNet
 from hm_sfm.training.losses import (
     FLOW_WEIGHT,
     measure_coarse_loss,

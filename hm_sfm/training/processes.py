@@ -14,7 +14,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from hm_sfm.errors import ConfigError
-from hm_sfm.matching.matcher import pick_device
+from hm_sfm.network.device import pick_device
 
 LONGEST_WAIT = timedelta(hours=2)
 """The others wait while the first process validates and saves."""

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from hm_sfm.geometry.frames import Grid
-from hm_sfm.matching.matcher import fine_cell_of
+from hm_sfm.matching.patches import fine_cell_of
 from hm_sfm.network.homography import apply_homography, is_regular, make_corners
 
 JITTERED_SHARE = 0.25

@@ -17,8 +17,9 @@ import numpy as np
 import pycolmap
 from tables import format_table
 
-from hm_sfm.matching.matcher import HomoMatcher, digest_weights
+from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.store import digest_image
+from hm_sfm.network.checkpoints import digest_weights
 from hm_sfm.pairs.retrieval import CellStore, describe_images, find_similar
 from hm_sfm.photos.images import list_images
 from hm_sfm.types import ImagePair, ImageRef
@@ -76,7 +77,7 @@ def main() -> None:
     for among in ("itself", "all") if len(scenes) > 1 else ("itself",):
         for scene, (own, overlapping) in scenes.items():
             images = own if among == "itself" else everything
-            descriptors = describe_images(images, digests, matcher, store)
+            descriptors = describe_images(images, digests, matcher.encoder.encode_plain, store)
             scores = score([image.name for image in images], descriptors, overlapping, options.top)
             rows.append({"scene": scene, "among": among, "images": len(images), "true": len(overlapping), **scores})
     print(format_table(rows))

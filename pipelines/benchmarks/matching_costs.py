@@ -75,7 +75,8 @@ def measure_method(
 
 def time_hm_sfm(_: str, images: Sequence[Any], config: Config) -> tuple[dict[str, float], int]:
     """Seconds by stage, over all photos and pairs, and the number of matches."""
-    from hm_sfm.matching.matcher import HomoMatcher, ImageFeatures
+    from hm_sfm.matching.interfaces import ImageFeatures
+    from hm_sfm.matching.matcher import HomoMatcher
     from hm_sfm.photos.images import prepare_image
     from hm_sfm.pipeline.reconstruction import open_store
     from hm_sfm.types import ImagePair, ImageRef, PairMatches

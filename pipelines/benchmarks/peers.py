@@ -24,8 +24,11 @@ from tqdm import tqdm
 from hm_sfm.config import Config
 from hm_sfm.errors import InputError
 from hm_sfm.evaluation.relative_poses import PointMatches
-from hm_sfm.matching.coarse_matches import LightGlueCoarse, XfeatCoarse, to_px
-from hm_sfm.matching.matcher import HomoMatcher, pick_device
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.matching.providers.lightglue import LightGlueCoarse
+from hm_sfm.matching.providers.packages import to_px
+from hm_sfm.matching.providers.xfeat import XfeatCoarse
+from hm_sfm.network.device import pick_device
 from hm_sfm.photos.images import PreparedImage, prepare_image, read_ref
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 

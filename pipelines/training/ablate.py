@@ -36,7 +36,7 @@ from ablation_scores import (
 from hm_sfm.config import load_config
 from hm_sfm.errors import ConfigError, HmSfmError
 from hm_sfm.io.atomic import replace_file
-from hm_sfm.matching.matcher import digest_weights, load_weights
+from hm_sfm.network.checkpoints import digest_weights, load_weights
 from hm_sfm.training.loop import TrainConfig, train
 
 SUPERVISIONS = {"semi-dense": "centre", "+ dense": "dense", "+ suppressed": "suppressed"}

@@ -15,8 +15,13 @@ from torch import Tensor
 from hm_sfm.config import ImageConfig, MatchingConfig, fingerprint
 from hm_sfm.evaluation.relative_poses import PosePair, read_strecha_pairs, score_poses
 from hm_sfm.io.atomic import replace_file, write_json
-from hm_sfm.matching.matcher import FINE_CHUNK, HomoMatcher, HomoNet, autocast, pad_image, read_checkpoint
+from hm_sfm.matching.encoder import pad_image
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.matching.patches import FINE_CHUNK
+from hm_sfm.network.checkpoints import read_checkpoint
+from hm_sfm.network.device import autocast
 from hm_sfm.network.fine import make_fine_map
+from hm_sfm.network.homonet import HomoNet
 from hm_sfm.photos.images import prepare_image, read_ref
 from hm_sfm.training.loop import TrainConfig, run_fingerprint
 from hm_sfm.training.losses import DENSE_RADIUS
@@ -94,7 +99,9 @@ def score_once(path: Path, score: Callable[[], Scores]) -> Scores:
 def make_matcher(net: HomoNet, config: TrainConfig) -> HomoMatcher:
     """The network with the threshold that its coarse stage is trained for: a similarity for plain features."""
     threshold = MatchingConfig().coarse_threshold if net.config.coarse == "cosine" else config.coarse_threshold
-    return HomoMatcher(net, MatchingConfig(coarse_threshold=threshold, device=config.device), ImageConfig())
+    return HomoMatcher.from_network(
+        net, MatchingConfig(coarse_threshold=threshold, device=config.device), ImageConfig()
+    )
 
 
 def score_cells(net: HomoNet, trial: Trial) -> Scores:

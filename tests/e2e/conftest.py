@@ -17,7 +17,9 @@ import numpy as np
 import pytest
 
 from hm_sfm.cli import main
-from hm_sfm.matching.matcher import HomoMatcher, HomoNet, load_weights, save_weights
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.network.checkpoints import load_weights, save_weights
+from hm_sfm.network.homonet import HomoNet
 from hm_sfm.synthetic.demo import write_demo
 from hm_sfm.synthetic.textures import make_texture
 from hm_sfm.types import PinholeView

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-import hm_sfm.matching.matcher as model
+from hm_sfm.network import checkpoints
+from hm_sfm.network.homonet import HomoNet
 from hm_sfm.training import loop
 
 TRAINING = Path(__file__).parents[2] / "pipelines" / "training"
@@ -38,7 +39,7 @@ def ablate(scene, tmp_path, monkeypatch, capfd):
         cv2.imwrite(str(photos / f"{seed}.png"), np.clip(128 + 40 * noise / noise.std(), 0, 255).astype(np.uint8))
     config = tmp_path / "train.yaml"
     config.write_text(
-        f"{{images: {photos}, out: {tmp_path / 'variants'}, start_from: {model.find_weights('light')}, "
+        f"{{images: {photos}, out: {tmp_path / 'variants'}, start_from: {checkpoints.find_weights('light')}, "
         "size_px: 64, pairs_per_step: 1, patches_per_pair: 8, precision: fp32, device: cpu}"
     )
 
@@ -53,10 +54,10 @@ def ablate(scene, tmp_path, monkeypatch, capfd):
 
 
 def test_ablate(ablate, tmp_path, monkeypatch, matched_pairs):
-    light = model.load_weights("light")
-    attentive = model.HomoNet(dataclasses.replace(light.config, coarse="attention"))
+    light = checkpoints.load_weights("light")
+    attentive = HomoNet(dataclasses.replace(light.config, coarse="attention"))
     attentive.load_state_dict(light.state_dict(), strict=False)
-    model.save_weights(tmp_path / "attention.pt", attentive)
+    checkpoints.save_weights(tmp_path / "attention.pt", attentive)
     weights = ("--attention-weights", str(tmp_path / "attention.pt"))
 
     tables = ablate(*weights).partition("\n## ")[2].strip()
@@ -77,7 +78,7 @@ def test_ablate(ablate, tmp_path, monkeypatch, matched_pairs):
     ]
 
     # The variants have the features in common that they start from; all heads start new.
-    features = model.read_checkpoint(tmp_path / "variants" / "features.pt")["state_dict"]
+    features = checkpoints.read_checkpoint(tmp_path / "variants" / "features.pt")["state_dict"]
     assert features.keys() == {key for key in light.state_dict() if not key.startswith("head.")}
 
     # All is done: nothing is trained or matched, and without the weights there are two tables.

@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
-import hm_sfm.matching.matcher as model
+from hm_sfm.network import checkpoints
 from hm_sfm.photos.images import list_images, prepare_image
 from hm_sfm.synthetic.textures import make_texture
 
@@ -283,18 +283,18 @@ def test_an_unknown_key_in_a_configuration_file(scene, tmp_path, run):
 @pytest.mark.parametrize("damage", ["cut", "text", "empty"])
 def test_a_damaged_weights_file(damage, scene, tmp_path, run):
     weights = tmp_path / "mine.pt"
-    whole = model.find_weights("light").read_bytes()
+    whole = checkpoints.find_weights("light").read_bytes()
     weights.write_bytes({"cut": whole[: len(whole) // 2], "text": b"no weights", "empty": b""}[damage])
     finished = run("match", scene.images, tmp_path / "out", "--model", weights)
     assert_refused(finished, weights, "is damaged or no hm_sfm weights file")
 
 
 def test_damaged_bundled_weights(scene, out, tmp_path, run, monkeypatch, digest_files):
-    bundled = Path(shutil.copytree(model.WEIGHTS_FOLDER, tmp_path / "weights"))
+    bundled = Path(shutil.copytree(checkpoints.WEIGHTS_FOLDER, tmp_path / "weights"))
     data = bytearray((bundled / "light.pt").read_bytes())
     data[len(data) // 2] ^= 1
     (bundled / "light.pt").write_bytes(data)
-    monkeypatch.setattr(model, "WEIGHTS_FOLDER", bundled)
+    monkeypatch.setattr(checkpoints, "WEIGHTS_FOLDER", bundled)
     before = digest_files(out)
     assert_refused(run("match", scene.images, out), bundled / "light.pt", "is damaged: its sha256 is")
     assert digest_files(out) == before

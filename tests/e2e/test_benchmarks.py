@@ -17,8 +17,8 @@ from PIL import Image
 from hm_sfm.config import Config, VerificationConfig
 from hm_sfm.errors import InputError
 from hm_sfm.evaluation.relative_poses import PointMatches
-from hm_sfm.matching.coarse_matches import read_rgb, to_px
-from hm_sfm.photos.images import read_ref
+from hm_sfm.matching.providers.packages import to_px
+from hm_sfm.photos.images import read_ref, read_rgb
 from hm_sfm.types import ImagePair
 
 BENCHMARKS = Path(__file__).parents[2] / "pipelines" / "benchmarks"

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-import hm_sfm.matching.matcher as model
+from hm_sfm.network import checkpoints
 
 EXAMPLES = Path(__file__).parents[2] / "pipelines" / "examples"
 
@@ -58,11 +58,11 @@ def test_hloc_style_steps(scene, out, run_recipe, matched_pairs):
 
 
 def test_compare_tracks(scene, out, expectation_weights, tmp_path, run_recipe, monkeypatch):
-    weights = Path(shutil.copytree(model.WEIGHTS_FOLDER, tmp_path / "weights"))
+    weights = Path(shutil.copytree(checkpoints.WEIGHTS_FOLDER, tmp_path / "weights"))
     shutil.copy(expectation_weights, weights / "light_expectation.pt")
-    digest = model.digest_weights(str(expectation_weights))
+    digest = checkpoints.digest_weights(str(expectation_weights))
     (weights / "light_expectation.sha256").write_text(f"{digest}  light_expectation.pt\n")
-    monkeypatch.setattr(model, "WEIGHTS_FOLDER", weights)
+    monkeypatch.setattr(checkpoints, "WEIGHTS_FOLDER", weights)
     (out / "matches.h5").rename(out / "homographies.h5")
     printed = run_recipe("compare_tracks.py", scene.images, out, scene.folder / "ground_truth")
     rows = re.findall(r"^(\w+): (\d) of 5 images, \d+ points, tracks of (.*) images, .* px$", printed, re.MULTILINE)

@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 from hm_sfm.colmap.database import read_verified_matches
-from hm_sfm.colmap.models import quiet_colmap
+from hm_sfm.io.colmap_log import quiet_colmap
 
 
 def assert_refused(finished, *parts: object) -> None:

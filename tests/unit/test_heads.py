@@ -5,9 +5,9 @@ import torch
 
 from hm_sfm.config import NetworkConfig
 from hm_sfm.errors import ConfigError
-from hm_sfm.matching.matcher import HomoNet
 from hm_sfm.network.fine import ExpectationHead, HomographyHead, gather_patches, make_fine_map
 from hm_sfm.network.homography import apply_homography, make_corners
+from hm_sfm.network.homonet import HomoNet
 from hm_sfm.training.losses import measure_loss
 from hm_sfm.training.supervision import PatchSupervision
 

@@ -12,17 +12,12 @@ import torch
 from hm_sfm import HomoMatcher
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig, load_config
 from hm_sfm.errors import ConfigError, InputError, WeightsError
-from hm_sfm.matching import matcher as model
-from hm_sfm.matching.matcher import (
-    HomoNet,
-    digest_weights,
-    load_parts,
-    load_weights,
-    pick_device,
-    save_weights,
-    scale_from_score,
-    score_from_scale,
-)
+from hm_sfm.matching.patches import scale_from_score, score_from_scale
+from hm_sfm.network import checkpoints
+from hm_sfm.network.backbone import LightBackbone
+from hm_sfm.network.checkpoints import digest_weights, load_parts, load_weights, save_weights
+from hm_sfm.network.device import pick_device
+from hm_sfm.network.homonet import HomoNet
 from hm_sfm.types import PatchMatches
 
 
@@ -172,8 +167,8 @@ def test_weights_of_which_nothing_fits_are_refused(tmp_path, small_net, state, m
 
 def test_one_flipped_byte_in_the_bundled_weights_is_noticed(tmp_path, monkeypatch):
     folder = tmp_path / "weights"
-    shutil.copytree(model.WEIGHTS_FOLDER, folder)
-    monkeypatch.setattr(model, "WEIGHTS_FOLDER", folder)
+    shutil.copytree(checkpoints.WEIGHTS_FOLDER, folder)
+    monkeypatch.setattr(checkpoints, "WEIGHTS_FOLDER", folder)
     load_weights("light")
     data = bytearray((folder / "light.pt").read_bytes())
     data[len(data) // 2] ^= 1
@@ -331,13 +326,13 @@ def test_the_expectation_head_matches_too(tmp_path):
     torch.manual_seed(0)
     net = HomoNet(NetworkConfig(head="expectation"))
     net.backbone.load_state_dict(load_weights("light").backbone.state_dict())
-    found = HomoMatcher(net, MatchingConfig(), ImageConfig()).match(*[make_texture(160, 128)] * 2)
+    found = HomoMatcher.from_network(net, MatchingConfig(), ImageConfig()).match(*[make_texture(160, 128)] * 2)
     assert len(found) > 50
     assert (np.linalg.norm(found.xy1 - found.xy0, axis=1) < 12).all()
 
 
 def test_scores_are_probabilities_of_less_than_a_pixel():
-    score = score_from_scale(np.log([1e-3, 0.5, 50.0]), model.LightBackbone.fine_grid)
+    score = score_from_scale(np.log([1e-3, 0.5, 50.0]), LightBackbone.fine_grid)
     np.testing.assert_allclose(score, [1.0, 1 - np.exp(-1), 0.01], atol=1e-3)
 
 
@@ -408,7 +403,7 @@ def test_densify_refuses_what_the_homographies_do_not_cover(radius):
 
 
 def test_the_scale_of_a_score_gives_the_score():
-    grid = model.LightBackbone.fine_grid
+    grid = LightBackbone.fine_grid
     for score in (0.1, 0.5, 0.9):
         assert score_from_scale(np.array([scale_from_score(score, grid)]), grid)[0] == pytest.approx(score)
 
@@ -439,6 +434,6 @@ def test_weights_without_counters_of_batches_load():
     net = load_weights("light")
     state = {key: value for key, value in net.state_dict().items() if not key.endswith("num_batches_tracked")}
     assert len(state) < len(net.state_dict())
-    model.fit_state(net, state, Path("old.pt"))
+    checkpoints.fit_state(net, state, Path("old.pt"))
     with pytest.raises(WeightsError, match="missing: head.corners.weight"):
-        model.fit_state(net, {k: v for k, v in state.items() if k != "head.corners.weight"}, Path("short.pt"))
+        checkpoints.fit_state(net, {k: v for k, v in state.items() if k != "head.corners.weight"}, Path("short.pt"))

@@ -10,10 +10,10 @@ import torch
 
 from hm_sfm.config import NetworkConfig
 from hm_sfm.errors import ConfigError
-from hm_sfm.matching.matcher import HomoNet
 from hm_sfm.network.backbone import LightBackbone
 from hm_sfm.network.fine import FineEstimate
 from hm_sfm.network.homography import apply_homography, homography_from_corners, make_corners
+from hm_sfm.network.homonet import HomoNet
 from hm_sfm.training import objectives
 from hm_sfm.training.loop import train
 from hm_sfm.training.losses import SCALE_WEIGHT, measure_errors, measure_loss

@@ -188,7 +188,7 @@ def test_what_was_done_is_not_done_again_and_other_edges_are(photos, matcher, tm
 def test_strips_make_the_features_of_the_whole(photos, matcher, monkeypatch):
     image = prepare_image(photos[0], SIZE_WH[0])
     whole = encode_for_refinement(matcher, image)
-    monkeypatch.setattr(refined_patches, "STRIP_PX", 512)
+    monkeypatch.setattr("hm_sfm.matching.encoder.STRIP_PX", 512)
     strips = encode_for_refinement(matcher, image)
     assert strips.fine.size_wh == whole.fine.size_wh == (SIZE_WH[0] // 2, SIZE_WH[1] // 2)
     off = (strips.fine.cells - whole.fine.cells).abs().float()
@@ -235,4 +235,4 @@ def test_an_expectation_head_is_refused(photos, matcher, tmp_path):
     net = HomoMatcher.from_pretrained("light_expectation").net
     assert isinstance(net.head, ExpectationHead)
     with pytest.raises(ConfigError, match="keypoints.refine_long_edge_px needs network.head homography"):
-        refine(connect_photos(photos), photos, HomoMatcher(net, matcher.config, matcher.images), tmp_path)
+        refine(connect_photos(photos), photos, HomoMatcher.from_network(net, matcher.config, matcher.images), tmp_path)

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from hm_sfm.config import Config, ImageConfig, MatchingConfig, NetworkConfig, PairConfig
+from hm_sfm.config import Config, MatchingConfig, NetworkConfig, PairConfig
 from hm_sfm.errors import InputError
 from hm_sfm.io import batches
-from hm_sfm.matching.matcher import HomoMatcher, HomoNet
+from hm_sfm.matching.encoder import Encoder
+from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.network.homonet import HomoNet
 from hm_sfm.pairs import retrieval
 from hm_sfm.pairs.retrieval import (
     CELLS_PER_IMAGE,
@@ -50,14 +52,15 @@ class Ring:
         self.images = [ImageRef(name, name, (640, 480)) for name in self.cells]
         self.digests = {name: f"{i:016x}" for i, name in enumerate(self.cells)}
         self.encoded: list[str] = []
+        self.encoder = self
 
-    def encode_plain(self, name: str) -> torch.Tensor:
+    def encode_plain(self, name: str) -> np.ndarray:
         self.encoded.append(name)
-        return torch.from_numpy(self.cells[name])
+        return self.cells[name]
 
     def describe(self, folder, weights: str = "a", images=None, digests=None) -> np.ndarray:
         store = CellStore(folder, weights)
-        return describe_images(images or self.images, digests or self.digests, self, store, quiet=True)
+        return describe_images(images or self.images, digests or self.digests, self.encode_plain, store, quiet=True)
 
 
 @pytest.fixture
@@ -221,8 +224,8 @@ def test_turned_photos_are_found(tmp_path):
             cv2.imwrite(str(tmp_path / name), photo)
     images = [read_ref(tmp_path / f"{i}.png") for i in range(8)]
     digests, store = {image.name: image.name for image in images}, CellStore(tmp_path / "cells", "a")
-    upright = describe_images(images, digests, matcher, store, quiet=True)
-    turned = describe_images(images, digests, matcher, store, quiet=True, turned=True)
+    upright = describe_images(images, digests, matcher.encoder.encode_plain, store, quiet=True)
+    turned = describe_images(images, digests, matcher.encoder.encode_plain, store, quiet=True, turned=True)
     assert turned.shape[:2] == (4, 8) and turned.dtype == np.float32
     expected = [4, 5, 6, 7, 0, 1, 2, 3]
     assert find_similar(turned, 1).ravel().tolist() == expected != find_similar(upright, 1).ravel().tolist()
@@ -278,9 +281,9 @@ def test_a_thousand_photos_need_few_pairs(monkeypatch, tmp_path):
 def test_plain_features_are_those_that_the_coarse_stage_starts_from(backbone, coarse):
     torch.manual_seed(0)
     net = HomoNet(NetworkConfig(backbone=backbone, coarse=coarse))
-    matcher = HomoMatcher(net, Config().matching, ImageConfig())
+    encoder = Encoder(net, torch.device("cpu"))
     image = prepare_array(np.random.default_rng(0).integers(0, 255, (64, 100), np.uint8), 1024)
-    plain, described = matcher.encode_plain(image), matcher.encode(image).coarse
+    plain, described = torch.tensor(encoder.encode_plain(image)), encoder.encode(image).coarse
     assert plain.dtype == torch.float32 and len(plain) == len(described) == 8 * (12 if backbone == "light" else 13)
     torch.testing.assert_close(plain.norm(dim=1), torch.ones(len(plain)), atol=1e-3, rtol=0)
     if backbone == "light":

@@ -106,7 +106,8 @@ class CountingMatcher:
     """Encodes photos of 1 MB each and notes which."""
 
     def __init__(self, feature_cache_mb: int) -> None:
-        self.config = SimpleNamespace(feature_cache_mb=feature_cache_mb, engine="serial", try_hypotheses=False)
+        self.config = SimpleNamespace(feature_cache_mb=feature_cache_mb, engine="serial")
+        self.cell_matcher = None
         self.images = SimpleNamespace(long_edge_px=64)
         self.encoded: list[str] = []
 

@@ -15,7 +15,7 @@ from torch.utils.data import Dataset, default_collate
 
 from hm_sfm.config import NetworkConfig, load_config
 from hm_sfm.errors import ConfigError, HmSfmError, InputError, WeightsError
-from hm_sfm.matching.matcher import load_weights
+from hm_sfm.network.checkpoints import load_weights
 from hm_sfm.training import loop
 from hm_sfm.training.curves import draw_curves
 from hm_sfm.training.loop import MegaDepthSource, MultiviewSource, TrainConfig, learning_rate_at, train

@@ -11,16 +11,12 @@ from tqdm import tqdm
 
 from hm_sfm.config import ImageConfig, MatchingConfig
 from hm_sfm.geometry.frames import pixel_index_from_px, rotation_matrix
-from hm_sfm.matching.coarse_matches import read_rgb
 from hm_sfm.matching.hypotheses import (
     FEW_MATCHES,
-    IDENTITY,
     ROTATIONS,
     SCALES,
     UNCHANGED,
-    Hypothesis,
     Sketch,
-    apply_hypothesis,
     choose_hypotheses,
     count_agreeing,
     count_good,
@@ -29,7 +25,8 @@ from hm_sfm.matching.hypotheses import (
 )
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.run import FeatureCache
-from hm_sfm.photos.images import CV_ROTATIONS, prepare_array, prepare_image, read_ref
+from hm_sfm.photos.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
+from hm_sfm.photos.images import CV_ROTATIONS, prepare_array, prepare_image, read_ref, read_rgb
 from hm_sfm.synthetic.textures import MATERIALS, make_texture
 from hm_sfm.types import ImagePair, PatchMatches, apply_homographies
 
@@ -80,7 +77,7 @@ def matcher() -> HomoMatcher:
 @pytest.fixture(scope="module")
 def upright(matcher) -> HomoMatcher:
     """The same one, that tries nothing else."""
-    return HomoMatcher(matcher.net, MatchingConfig(try_hypotheses=False), ImageConfig())
+    return HomoMatcher.from_network(matcher.net, MatchingConfig(try_hypotheses=False), ImageConfig())
 
 
 def turn(image: np.ndarray, rotation_deg: int) -> np.ndarray:
@@ -142,8 +139,8 @@ def test_nothing_to_see(matcher, photo):
     for pair in ((flat, photo), (flat, flat), (tiny, flat)):
         matches = matcher.match(*pair)
         assert np.isfinite(matches.homography).all() and count_good(matches) < 100
-        sketches = [Sketch(matcher, prepare_array(image, 1024)) for image in pair]
-        assert choose_hypotheses(matcher, *sketches) is None
+        sketches = [Sketch(prepare_array(image, 1024)) for image in pair]
+        assert choose_hypotheses(matcher.cell_matcher, *sketches) is None
 
 
 @pytest.fixture
@@ -184,10 +181,10 @@ def test_given_matches_of_turned_photos_become_homographies(matcher, folder, tmp
     with h5py.File(tmp_path / "points.h5", "w") as h5:
         h5["a.png/b.png/keypoints0"], h5["a.png/b.png/keypoints1"] = map(pixel_index_from_px, (xy0, xy1))
     config = MatchingConfig(coarse_matches=str(tmp_path / "points.h5"))
-    given = HomoMatcher(matcher.net, config, ImageConfig())
+    given = HomoMatcher.from_network(matcher.net, config, ImageConfig())
     assert_right(given.match(folder / "a.png", folder / "b.png"), truth, len(xy0) // 2)
     config = dataclasses.replace(config, try_hypotheses=False)
-    alone = HomoMatcher(matcher.net, config, ImageConfig()).match(folder / "a.png", folder / "b.png")
+    alone = HomoMatcher.from_network(matcher.net, config, ImageConfig()).match(folder / "a.png", folder / "b.png")
     assert count_good(alone) < len(xy0) // 4
 
 

@@ -1,15 +1,16 @@
 """The coarse stage of other weights, as a provider of coarse matches: a public LoFTR's, or one made by hm-sfm train."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig
-from hm_sfm.matching.coarse_matches import PointPairs
-from hm_sfm.matching.matcher import HomoMatcher, ImageFeatures, load_weights, read_checkpoint
+from hm_sfm.config import MatchingConfig, NetworkConfig
+from hm_sfm.matching.cells import CoarseCells
+from hm_sfm.matching.encoder import Encoder
+from hm_sfm.matching.interfaces import ImageFeatures, PointPairs
+from hm_sfm.network.checkpoints import load_weights, read_checkpoint
 from hm_sfm.photos.images import PreparedImage
 
 LOFTR = NetworkConfig(backbone="loftr", head="expectation", coarse="attention", iterations=1, margin=0)
@@ -27,20 +28,19 @@ class WeightsCoarse:
     def __init__(self, weights: Path, config: MatchingConfig, device: torch.device) -> None:
         net = load_weights(str(weights), None if "network" in read_checkpoint(weights) else LOFTR)
         threshold = config.coarse_threshold if net.config.coarse == "cosine" else LEAST_CONFIDENCE
-        own = replace(config, coarse="light", coarse_threshold=threshold, device=str(device))
-        self.matcher = HomoMatcher(net, own, ImageConfig())
+        self.cells = CoarseCells(Encoder(net, device), threshold)
 
     def describe(self, image: PreparedImage) -> dict[str, Any]:
         """`cells` (H, W, C) float32."""
-        return {"cells": self.matcher.encode_coarse(image)}
+        return {"cells": self.cells.encode(image)}
 
     def match(self, features0: ImageFeatures, features1: ImageFeatures) -> PointPairs:
-        """The centres of the cells. The score is the coarse stage's confidence."""
-        cells = [features.found["cells"] for features in (features0, features1)]
-        *indices, score = self.matcher.match_coarse(*cells)
-        grid = self.matcher.net.backbone.coarse_grid
-        xy0, xy1 = (
-            grid.to_px(np.stack([index % of.shape[1], index // of.shape[1]], axis=1).astype(np.float64))
-            for index, of in zip(indices, cells)
-        )
-        return PointPairs(xy0, xy1, score)
+        """The points are the centres of the cells, the score is that of the coarse stage."""
+        cells0, cells1 = (features.description["cells"] for features in (features0, features1))
+        index0, index1, score = self.cells.match(cells0, cells1)
+        return PointPairs(self._locate(index0, cells0.shape[1]), self._locate(index1, cells1.shape[1]), score)
+
+    def _locate(self, index: np.ndarray, columns: int) -> np.ndarray:
+        """(M,) int64 cells, counted row by row -> (M, 2) float64 px of the network's input."""
+        grid = self.cells.encoder.net.backbone.coarse_grid
+        return grid.to_px(np.stack([index % columns, index // columns], axis=1).astype(np.float64))

@@ -1,0 +1,99 @@
+"""Prepared images -> the network's features: coarse cells, fine cells, or both."""
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from hm_sfm.matching.interfaces import ImageFeatures
+from hm_sfm.network.backbone import FeatureMaps
+from hm_sfm.network.device import autocast
+from hm_sfm.network.fine import FineMap, make_fine_map
+from hm_sfm.network.homonet import HomoNet
+from hm_sfm.photos.images import PreparedImage
+
+STRIP_PX = 1024
+"""encode_fine takes large photos in strips of so many rows, to bound the memory,"""
+MARGIN_PX = 128
+"""with so many more on each side as the network looks around. Both are multiples of any backbone's stride."""
+
+
+class Encoder:
+    """A network on a device, ready to encode images. The network is moved there and frozen."""
+
+    def __init__(self, net: HomoNet, device: torch.device) -> None:
+        self.device = device
+        self.net = net.to(device).eval().requires_grad_(False)
+        self.net.backbone.to(memory_format=torch.channels_last)  # half the time on a CPU
+
+    @torch.inference_mode()
+    def encode(self, image: PreparedImage) -> ImageFeatures:
+        """All features of an image, described by no provider yet."""
+        maps = self._run_backbone(self._pad(image))
+        coarse = self._describe_cells(maps.coarse, image)
+        rows, columns = coarse.shape[:2]
+        y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+        return ImageFeatures(
+            coarse=coarse.flatten(0, 1),
+            cell=torch.stack([x, y], dim=-1).reshape(-1, 2).to(self.device),
+            fine=make_fine_map(maps.fine),
+            scaled_wh=image.scaled_wh,
+            stored_from_scaled=image.stored_from_scaled,
+            image=image.ref,
+        )
+
+    @torch.inference_mode()
+    def encode_coarse(self, image: PreparedImage) -> Tensor:
+        """(H, W, C) float32: the cells of ImageFeatures.coarse on their grid, without the rest."""
+        return self._describe_cells(self._run_backbone(self._pad(image), want_fine=False).coarse, image)
+
+    @torch.inference_mode()
+    def encode_plain(self, image: PreparedImage) -> np.ndarray:
+        """(N, C) float32 of unit length: the 1/8 cells as the backbone sees them, without what only matching needs."""
+        coarse = self._run_backbone(self._pad(image), want_fine=False).coarse
+        columns, rows = self._count_coarse_cells(image)
+        return F.normalize(coarse[0, :, :rows, :columns].flatten(1).T.float(), dim=1).cpu().numpy()
+
+    @torch.inference_mode()
+    def encode_fine(self, image: PreparedImage) -> FineMap:
+        """The fine features alone, strip by strip: what the backbone makes of the whole, but for the last digits."""
+        pixels = self._pad(image)
+        stride, height = self.net.backbone.fine_grid.stride, pixels.shape[2]
+        strips = []
+        for top in range(0, height, STRIP_PX):
+            first, last = max(0, top - MARGIN_PX), min(height, top + STRIP_PX + MARGIN_PX)
+            fine = self._run_backbone(pixels[:, :, first:last]).fine
+            bottom = min(height, top + STRIP_PX)
+            strips.append(fine[:, :, (top - first) // stride : (bottom - first) // stride])
+        return make_fine_map(torch.cat(strips, dim=2))
+
+    def _pad(self, image: PreparedImage) -> Tensor:
+        backbone = self.net.backbone
+        return pad_image(torch.tensor(image.grey, device=self.device), backbone.stride, backbone.standardised)
+
+    def _run_backbone(self, pixels: Tensor, want_fine: bool = True) -> FeatureMaps:
+        with autocast(self.device):
+            return self.net.backbone(pixels, want_fine)
+
+    def _describe_cells(self, coarse: Tensor, image: PreparedImage) -> Tensor:
+        """The backbone's (1, C, H', W') -> (H, W, C) of the cells within the image, as the coarse stage sees them."""
+        columns, rows = self._count_coarse_cells(image)
+        with autocast(self.device):
+            described = self.net.coarse.describe(coarse[:, :, :rows, :columns])
+        return described[0].permute(1, 2, 0).contiguous()
+
+    def _count_coarse_cells(self, image: PreparedImage) -> tuple[int, int]:
+        """Columns and rows of the coarse cells whose centre lies within the image."""
+        columns, rows = (self.net.backbone.coarse_grid.count_cells(size) for size in image.scaled_wh)
+        return columns, rows
+
+
+def pad_image(grey: Tensor, stride: int, standardise: bool) -> Tensor:
+    """(H, W) float32 in [0, 1] -> (1, 1, H', W'), zero-padded right and bottom to multiples of `stride`.
+
+    standardise: to zero mean and unit variance first.
+    """
+    if standardise:
+        grey = (grey - grey.mean()) / grey.std().clamp_min(1e-3)
+    height, width = grey.shape
+    return F.pad(grey[None, None], (0, -width % stride, 0, -height % stride))

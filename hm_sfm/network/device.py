@@ -1,0 +1,26 @@
+"""Where the network computes, and whether in half precision."""
+
+import torch
+
+from hm_sfm.errors import ConfigError
+
+
+def pick_device(name: str) -> torch.device:
+    """`auto` is CUDA where there is one. Raises ConfigError on an unknown or absent device."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name not in ("cpu", "cuda"):
+        raise ConfigError(f"device must be auto, cpu or cuda, found {name!r}")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device cuda was asked for, but this PyTorch finds no CUDA GPU")
+    return torch.device(name)
+
+
+def autocast(device: torch.device) -> torch.autocast:
+    """Half precision for convolutions and matrix products, where the processor computes it natively."""
+    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=computes_in_half(device))
+
+
+def computes_in_half(device: torch.device) -> bool:
+    """Whether the processor computes in half precision natively; fine features take 2 bytes a number then, not 4."""
+    return device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()

@@ -1,4 +1,4 @@
-"""Stage 7: mapping, triangulation and bundle adjustment, through pycolmap.
+"""Mapping, triangulation and bundle adjustment, through pycolmap.
 
 Ctrl-C raises KeyboardInterrupt out of each of these functions within a second or so: pycolmap asks for signals while
 it works; the last adjustment of a model, the global mapper and triangulation run through. What is written to disk
@@ -11,16 +11,18 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from hm_sfm.colmap.database import Cameras, open_database
+from hm_sfm.colmap.cameras import Cameras
+from hm_sfm.colmap.database import open_database
 from hm_sfm.colmap.rigs import lack_poses
 from hm_sfm.colmap.snapshots import SNAPSHOT_FOLDER, Snapshots, digest_inputs
-from hm_sfm.config import MappingConfig
-from hm_sfm.errors import ConfigError
+from hm_sfm.config import MappingConfig, VerificationConfig
 from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.photos.bitmaps import open_to_colmap
 from hm_sfm.types import ImageRef, MappingResult
@@ -30,13 +32,6 @@ logger = logging.getLogger(__name__)
 # Global bundle adjustment each time the model grew by 30 %, not COLMAP's 10 %: about a fifth less time on dense
 # keypoints, at the same result; local bundle adjustment follows every image anyway.
 GLOBAL_ADJUSTMENT_RATIO = 1.3
-
-# Observations farther from their point than this are dropped: what verification allows by default. COLMAP's own 4 px are
-# meant for keypoints that are less exact.
-FILTER_ERROR_PX = 3.0
-
-# Error of matches that calibration allows, of the longer side of the photos: what verification allows by default.
-CALIBRATION_ERROR = 0.003
 
 # While a model grows, its adjustments end where they gain less than this (relative); the last one, over everything, is
 # exact. Half the time of COLMAP's own limits; points and poses are the same to a tenth of their error.
@@ -50,57 +45,65 @@ LOCAL_REFINEMENTS = 1
 SNAPSHOT_IMAGES = 20
 
 
-def map_images(
-    database_path: Path,
-    image_folder: Path,
-    sparse_folder: Path,
-    images: Sequence[ImageRef],
-    cameras: Cameras,
-    config: MappingConfig,
-    on_image: Callable[[], None] | None = None,
-) -> tuple[pycolmap.Reconstruction, ...]:
+@dataclass(frozen=True)
+class MappingTask:
+    """A verified database to build models from, and how."""
+
+    database: Path
+    image_folder: Path
+    """For the colours of the points."""
+    sparse_folder: Path
+    """The models go to its subfolders 0, 1, ..., as COLMAP binary; what it held before is gone then."""
+    config: MappingConfig = field(default_factory=MappingConfig)
+    max_error_px: float = VerificationConfig().max_error_px
+    """Px of the stored images, whatever their size: observations farther than this from their point are dropped.
+    COLMAP's own 4 px are meant for keypoints that are less exact. Calibration before global mapping allows the same
+    error in photos of 1000 px, and as much more as photos are larger."""
+    fix_intrinsics: bool = False
+    """Keep all cameras as the database has them."""
+    on_image: Callable[[], None] | None = None
+    """Called once per registered image, of a rig once per frame."""
+
+
+def map_images(task: MappingTask, images: Sequence[ImageRef], cameras: Cameras) -> tuple[pycolmap.Reconstruction, ...]:
     """Build models from a verified database: triangulate_images where the poses are known, else by `config.mapper`.
 
-    images, cameras: those that the database was written with. Where their rigs lack poses, calibrate_rigs finds them
-    first. Arguments, results and what is raised are otherwise those of map_incrementally; raises ConfigError where
-    there is no such mapper.
+    images, cameras: those that the database was written with; `cameras.known` decides whether the intrinsics are fixed.
+    Where their rigs lack poses, calibrate_rigs finds them first. Results, and what is raised, are otherwise those of
+    map_incrementally.
     """
-    if cameras.cam_from_world:
-        with open_to_colmap(images, image_folder) as readable_folder:
-            return triangulate_images(database_path, readable_folder, sparse_folder, images, cameras, config, on_image)
-    build = choose_mapper(config)
-    with open_to_colmap(images, image_folder) as readable_folder:
+    with open_to_colmap(images, task.image_folder) as readable_folder:
+        task = replace(task, image_folder=readable_folder, fix_intrinsics=cameras.known)
+        if cameras.cam_from_world:
+            return triangulate_images(task, images, cameras)
         if lack_poses(cameras.rigs):
-            calibrate_rigs(database_path, readable_folder, cameras, config)
-        return build(database_path, readable_folder, sparse_folder, config, cameras.known, on_image)
+            calibrate_rigs(task, cameras.rigs)
+        return map_by_config(task)
 
 
-def choose_mapper(config: MappingConfig) -> Callable[..., tuple[pycolmap.Reconstruction, ...]]:
-    """map_incrementally or map_globally. Raises ConfigError where `config.mapper` is neither."""
-    mappers = {"incremental": map_incrementally, "global": map_globally}
-    if config.mapper not in mappers:
-        raise ConfigError(f"mapping.mapper must be incremental or global, found {config.mapper!r}")
-    return mappers[config.mapper]
+def map_by_config(task: MappingTask) -> tuple[pycolmap.Reconstruction, ...]:
+    """map_incrementally or map_globally, as `config.mapper` says."""
+    return map_globally(task) if task.config.mapper == "global" else map_incrementally(task)
 
 
-def calibrate_rigs(database_path: Path, image_folder: Path, cameras: Cameras, config: MappingConfig) -> bool:
-    """Find the poses that `cameras.rigs` lack, and write them to the database, as COLMAP's rig_configurator does it.
+def calibrate_rigs(task: MappingTask, rigs: Sequence[pycolmap.RigConfig]) -> bool:
+    """Find the poses that `rigs` lack, and write them to the database, as COLMAP's rig_configurator does it.
 
     A model is built as if there were no rigs, by `config.mapper`; the poses are averages over it. COLMAP needs them to
-    map with rigs. Returns whether they were found; where not, the database has no rigs any more, and a warning is
+    map with rigs. Returns whether all were calibrated; where not, the database has no rigs any more, and a warning is
     logged.
     """
-    database_path = Path(database_path)
+    database_path = Path(task.database)
     with _make_work_folder(database_path.parent, ".rigs.") as work_folder:
         own_copy = work_folder / "database.db"
         shutil.copy(database_path, own_copy)
         with quiet_colmap(pycolmap.logging.FATAL), pycolmap.Database.open(own_copy) as database:
             pycolmap.apply_rig_config([], database)
-        build = choose_mapper(config)
-        models = build(own_copy, image_folder, work_folder / "sparse", config, cameras.known)
+        without_rigs = replace(task, database=own_copy, sparse_folder=work_folder / "sparse", on_image=None)
+        models = map_by_config(without_rigs)
         with quiet_colmap(pycolmap.logging.FATAL), pycolmap.Database.open(own_copy) as database:
             if models:
-                pycolmap.apply_rig_config(list(cameras.rigs), database, models[0])
+                pycolmap.apply_rig_config(list(rigs), database, models[0])
             sensors = [pose for rig in database.read_all_rigs() for pose in rig.non_ref_sensors.values()]
             is_complete = bool(sensors) and all(pose is not None for pose in sensors)
             if not is_complete:
@@ -114,101 +117,58 @@ def calibrate_rigs(database_path: Path, image_folder: Path, cameras: Cameras, co
     return is_complete
 
 
-def map_incrementally(
-    database_path: Path,
-    image_folder: Path,
-    sparse_folder: Path,
-    config: MappingConfig,
-    fix_intrinsics: bool,
-    on_image: Callable[[], None] | None = None,
-) -> tuple[pycolmap.Reconstruction, ...]:
+def map_incrementally(task: MappingTask) -> tuple[pycolmap.Reconstruction, ...]:
     """Build models from a verified database with COLMAP's incremental mapper, then adjust and filter each of them.
 
-    image_folder: for the colours of the points. fix_intrinsics: keep all cameras as the database has them.
-    on_image: called once per registered image, of a rig once per frame; the mapper may register an image again in
-    another model or attempt.
+    The mapper may register an image again in another model or attempt: on_image is called again, too.
 
-    While a model grows, the folder `snapshots` beside `sparse_folder` holds its newest snapshot. The same call goes on
-    from there after it was killed; snapshots of another database or configuration are not used.
+    While a model grows, the folder `snapshots` beside the sparse folder holds its newest snapshot. The same call goes
+    on from there after it was killed; snapshots of another database or configuration are not used.
 
-    Returns the models, most registered images first, then most points. They are also in `sparse_folder`/0, 1, ... as
-    COLMAP binary, in this order; what the folder held before is gone, and without a model there is no folder.
-    Raises InputError where there is no database.
+    Returns the models, most registered images first, then most points; the sparse folder has them in this order.
+    Without a model there is no folder. Raises InputError where there is no database.
     """
-    return _write_models(
-        database_path,
-        sparse_folder,
-        lambda raw: _run_mapper(
-            database_path,
-            image_folder,
-            raw,
-            config,
-            fix_intrinsics,
-            on_image,
-            Path(sparse_folder).with_name(SNAPSHOT_FOLDER),
-        ),
-    )
+    return _write_models(task, partial(_run_mapper, task))
 
 
-def map_globally(
-    database_path: Path,
-    image_folder: Path,
-    sparse_folder: Path,
-    config: MappingConfig,
-    fix_intrinsics: bool,
-    on_image: Callable[[], None] | None = None,
-) -> tuple[pycolmap.Reconstruction, ...]:
+def map_globally(task: MappingTask) -> tuple[pycolmap.Reconstruction, ...]:
     """As map_incrementally, with COLMAP's global mapper: the rotations of all images, then all positions and points.
 
-    Focal lengths that nothing is known about are found first, from all pairs together; where that does not lead to a
-    model of all images, the guess of make_cameras is tried, too. The database stays as it is. on_image is called when
+    Focal lengths that nothing is known about are estimated first, from all pairs together; where that does not lead to
+    a model of all images, the guess of make_cameras is tried, too. The database stays as it is. on_image is called when
     all is done. The global mapper cannot be interrupted.
 
     It needs matches that are one to one and tracks with one keypoint per image, which IndexMatches and
     persist_keypoints guarantee: it stops at a match that occurs twice, and drops tracks whose observations in one image
     are more than 10 px apart.
     """
-    return _write_models(
-        database_path,
-        sparse_folder,
-        lambda raw: _run_global_mapper(database_path, image_folder, raw, config, fix_intrinsics, on_image),
-    )
+    return _write_models(task, partial(_run_global_mapper, task))
 
 
 def triangulate_images(
-    database_path: Path,
-    image_folder: Path,
-    sparse_folder: Path,
-    images: Sequence[ImageRef],
-    cameras: Cameras,
-    config: MappingConfig,
-    on_image: Callable[[], None] | None = None,
+    task: MappingTask, images: Sequence[ImageRef], cameras: Cameras
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """The points of a verified database by the poses `cameras.cam_from_world`; poses and intrinsics stay as they are.
 
     images, cameras: those that the database was written with. on_image is called when all is done.
 
-    Returns one model with all images, or none where no point was found; `sparse_folder` is as map_incrementally leaves
-    it. Raises InputError where there is no database.
+    Returns one model with all images, or none where there are no points; the sparse folder is as map_incrementally
+    leaves it. Raises InputError where there is no database.
     """
-    return _write_models(
-        database_path,
-        sparse_folder,
-        lambda raw: _run_triangulator(database_path, image_folder, raw, images, cameras, config, on_image),
-    )
+    return _write_models(task, partial(_run_triangulator, task, images, cameras))
 
 
 def _write_models(
-    database_path: Path, sparse_folder: Path, build: Callable[[Path], list[pycolmap.Reconstruction]]
+    task: MappingTask, build: Callable[[Path], list[pycolmap.Reconstruction]]
 ) -> tuple[pycolmap.Reconstruction, ...]:
-    """Sort the models that `build` makes, given a new folder to work in, and put them in the place of `sparse_folder`.
+    """Sort the models that `build` makes, given a new folder to work in, and put them in the sparse folder's place.
 
     Snapshots of them are then removed, and so is what killed processes left. Without verified matches there is nothing
     to build. Raises InputError where there is no database.
     """
-    sparse_folder = Path(sparse_folder)
+    sparse_folder = Path(task.sparse_folder)
     sparse_folder.parent.mkdir(parents=True, exist_ok=True)
-    with open_database(database_path) as database:
+    with open_database(task.database) as database:
         can_map = database.num_inlier_matches() > 0  # rejected pairs count as verified pairs, without inliers
     with _make_work_folder(sparse_folder.parent, f".{sparse_folder.name}.") as work_folder:
         models: list[pycolmap.Reconstruction] = []
@@ -244,21 +204,14 @@ def _make_work_folder(parent: Path, prefix: str) -> Iterator[Path]:
         yield Path(folder)
 
 
-def _run_mapper(
-    database_path: Path,
-    image_folder: Path,
-    output_folder: Path,
-    config: MappingConfig,
-    fix_intrinsics: bool,
-    on_image: Callable[[], None] | None,
-    snapshot_folder: Path,
-) -> list[pycolmap.Reconstruction]:
-    options = _pipeline_options(config, fix_intrinsics)
-    made_from = digest_inputs(database_path, config, fix_intrinsics)
+def _run_mapper(task: MappingTask, output_folder: Path) -> list[pycolmap.Reconstruction]:
+    options = _pipeline_options(task)
+    made_from = digest_inputs(task.database, task.config, task.max_error_px, task.fix_intrinsics)
+    snapshot_folder = Path(task.sparse_folder).with_name(SNAPSHOT_FOLDER)
     snapshots = Snapshots(snapshot_folder, output_folder.with_name("growing"), made_from)
     options.snapshot_path = snapshots.growing
     options.snapshot_frames_freq = SNAPSHOT_IMAGES
-    on_image = on_image or (lambda: None)
+    on_image = task.on_image or (lambda: None)
 
     def on_first_images() -> None:
         for _ in range(snapshots.begin_model()):
@@ -269,8 +222,8 @@ def _run_mapper(
         on_image()
 
     models = pycolmap.incremental_mapping(
-        database_path,
-        image_folder,
+        task.database,
+        task.image_folder,
         output_folder,
         options,
         input_path=snapshots.newest or "",
@@ -282,18 +235,18 @@ def _run_mapper(
     return list(models.values())
 
 
-def _pipeline_options(config: MappingConfig, fix_intrinsics: bool) -> pycolmap.IncrementalPipelineOptions:
+def _pipeline_options(task: MappingTask) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = config.seed
-    options.min_model_size = config.min_model_size
-    options.mapper.filter_max_reproj_error = FILTER_ERROR_PX
+    options.random_seed = task.config.seed
+    options.min_model_size = task.config.min_model_size
+    options.mapper.filter_max_reproj_error = task.max_error_px
     options.ba_global_frames_ratio = GLOBAL_ADJUSTMENT_RATIO
     options.ba_global_points_ratio = GLOBAL_ADJUSTMENT_RATIO
     options.ba_global_function_tolerance = GLOBAL_TOLERANCE
     options.ba_local_function_tolerance = LOCAL_TOLERANCE
     options.ba_global_max_refinements = GLOBAL_REFINEMENTS
     options.ba_local_max_refinements = LOCAL_REFINEMENTS
-    if fix_intrinsics:
+    if task.fix_intrinsics:
         options.ba_refine_focal_length = False
         options.ba_refine_principal_point = False
         options.ba_refine_extra_params = False
@@ -301,20 +254,13 @@ def _pipeline_options(config: MappingConfig, fix_intrinsics: bool) -> pycolmap.I
     return options
 
 
-def _run_global_mapper(
-    database_path: Path,
-    image_folder: Path,
-    output_folder: Path,
-    config: MappingConfig,
-    fix_intrinsics: bool,
-    on_image: Callable[[], None] | None,
-) -> list[pycolmap.Reconstruction]:
-    with open_database(database_path) as database:
+def _run_global_mapper(task: MappingTask, output_folder: Path) -> list[pycolmap.Reconstruction]:
+    with open_database(task.database) as database:
         cameras = database.read_all_cameras()
         pair_ids, geometries = database.read_two_view_geometries()
     verified = [pair_id for pair_id, geometry in zip(pair_ids, geometries) if len(geometry.inlier_matches)]
     num_connected = len({image_id for pair_id in verified for image_id in pycolmap.pair_id_to_image_pair(pair_id)})
-    unknown_focal = not fix_intrinsics and not all(camera.has_prior_focal_length for camera in cameras)
+    unknown_focal = not task.fix_intrinsics and not all(camera.has_prior_focal_length for camera in cameras)
 
     def rank(models: list[pycolmap.Reconstruction]) -> tuple[int, int]:
         return max(((model.num_reg_images(), model.num_points3D()) for model in models), default=(0, 0))
@@ -324,51 +270,44 @@ def _run_global_mapper(
     # anything: the first guess, which adjustment refines, is then the better start.
     for calibrate in (True, False) if unknown_focal else (False,):
         own_copy = output_folder / "database.db"  # calibration writes to it
-        shutil.copy(database_path, own_copy)
+        shutil.copy(task.database, own_copy)
         if calibrate:
-            max_error_px = CALIBRATION_ERROR * max(max(camera.width, camera.height) for camera in cameras)
-            options = pycolmap.ViewGraphCalibrationOptions(random_seed=config.seed, relpose_max_error=max_error_px)
+            long_edge_px = max(max(camera.width, camera.height) for camera in cameras)
+            max_error_px = task.max_error_px / 1000 * long_edge_px
+            options = pycolmap.ViewGraphCalibrationOptions(random_seed=task.config.seed, relpose_max_error=max_error_px)
             if not pycolmap.calibrate_view_graph(own_copy, options):
                 continue
-        best = max(best, _map_all(own_copy, image_folder, output_folder, config, fix_intrinsics), key=rank)
+        best = max(best, _map_all(replace(task, database=own_copy), output_folder), key=rank)
         if rank(best)[0] == num_connected:
             break
-    _report_images(best, on_image)
+    _report_images(best, task.on_image)
     return best
 
 
-def _map_all(
-    database_path: Path, image_folder: Path, output_folder: Path, config: MappingConfig, fix_intrinsics: bool
-) -> list[pycolmap.Reconstruction]:
+def _map_all(task: MappingTask, output_folder: Path) -> list[pycolmap.Reconstruction]:
     """The global mapper's models, adjusted, without the images that hardly any point supports."""
     options = pycolmap.GlobalPipelineOptions()
-    options.random_seed = config.seed
-    options.min_model_size = config.min_model_size
-    if fix_intrinsics:
+    options.random_seed = task.config.seed
+    options.min_model_size = task.config.min_model_size
+    if task.fix_intrinsics:
         options.mapper.bundle_adjustment.refine_focal_length = False
         options.mapper.bundle_adjustment.refine_principal_point = False
         options.mapper.bundle_adjustment.refine_extra_params = False
         options.mapper.retriangulation.max_extra_param = np.inf
-    models = list(pycolmap.global_mapping(database_path, image_folder, output_folder, options).values())
-    adjustment = _pipeline_options(config, fix_intrinsics)
+    models = list(pycolmap.global_mapping(task.database, task.image_folder, output_folder, options).values())
+    adjustment = _pipeline_options(task)
     for model in models:
         _adjust(model, adjustment)
         # It poses every image, the incremental mapper only those that so many points agree with.
-        fewest = adjustment.mapper.abs_pose_min_num_inliers
-        frames = {image.frame_id for image in model.images.values() if image.num_points3D >= fewest}
+        min_points = adjustment.mapper.abs_pose_min_num_inliers
+        frames = {image.frame_id for image in model.images.values() if image.num_points3D >= min_points}
         for frame_id in set(model.reg_frame_ids()) - frames:
             model.deregister_frame(frame_id)
-    return [model for model in models if model.num_reg_images() >= config.min_model_size]
+    return [model for model in models if model.num_reg_images() >= task.config.min_model_size]
 
 
 def _run_triangulator(
-    database_path: Path,
-    image_folder: Path,
-    output_folder: Path,
-    images: Sequence[ImageRef],
-    cameras: Cameras,
-    config: MappingConfig,
-    on_image: Callable[[], None] | None,
+    task: MappingTask, images: Sequence[ImageRef], cameras: Cameras, output_folder: Path
 ) -> list[pycolmap.Reconstruction]:
     model = pycolmap.Reconstruction()
     for camera in cameras.cameras:
@@ -377,12 +316,12 @@ def _run_triangulator(
     for image_id, (image, index, cam_from_world) in enumerate(rows, start=1):  # the ids of write_database
         row = pycolmap.Image(name=image.name, camera_id=cameras.cameras[index].camera_id, image_id=image_id)
         model.add_image_with_trivial_frame(row, cam_from_world)
-    options = _pipeline_options(config, fix_intrinsics=True)
-    model = pycolmap.triangulate_points(model, database_path, image_folder, output_folder, options=options)
+    options = _pipeline_options(replace(task, fix_intrinsics=True))
+    model = pycolmap.triangulate_points(model, task.database, task.image_folder, output_folder, options=options)
     if not model.num_points3D():
         return []
     model.update_point_3d_errors()
-    _report_images([model], on_image)
+    _report_images([model], task.on_image)
     return [model]
 
 
@@ -411,7 +350,7 @@ def _adjust(model: pycolmap.Reconstruction, options: pycolmap.IncrementalPipelin
 
 
 def summarise_models(models: Sequence[pycolmap.Reconstruction], num_images: int) -> MappingResult:
-    """The figures of the largest model, `models[0]`; all 0 where there is none.
+    """The metrics of the largest model, `models[0]`; all 0 where there is none.
 
     num_images: of the collection, registered or not. A track's length is the number of distinct images that see it;
     mean_reprojection_px is the mean over the points of each point's mean error, as COLMAP prints it.

@@ -31,8 +31,8 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     else:
         folder, endings = path, ENDINGS
     if not folder.is_dir():
-        found = "is neither a folder nor named cameras.txt or cameras.bin" if folder.exists() else "does not exist"
-        raise InputError(f"the COLMAP model {path} {found}")
+        reason = "is neither a folder nor named cameras.txt or cameras.bin" if folder.exists() else "does not exist"
+        raise InputError(f"the COLMAP model {path} {reason}")
     for ending in endings:
         if all((folder / f"{part}{ending}").is_file() for part in REQUIRED):
             return _read_files(folder, ending)

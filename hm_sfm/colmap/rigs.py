@@ -80,7 +80,7 @@ def read_rigs(path: Path) -> tuple[pycolmap.RigConfig, ...]:
                 camera.cam_from_rig = pycolmap.Rigid3d(rotation, camera.cam_from_rig.translation)
         rig.cameras = cameras
     has_pose = {camera.cam_from_rig is not None for rig in rigs for camera in rig.cameras if not camera.ref_sensor}
-    if len(has_pose) > 1:  # those that would be found have another scale than those that are known
+    if len(has_pose) > 1:  # calibrated ones would have another scale than those that are known
         raise InputError(
             f"{path} has a cam_from_rig of some cameras only: give it of all but those with ref_sensor, or none"
         )
@@ -140,8 +140,8 @@ def assign_cameras(
         takers = [taker for taker, prefix in prefixes.items() if name.startswith(prefix)]
         taken_by.append(takers[0] if takers else None)
         if len(takers) > 1:
-            found = " and ".join(repr(prefixes[taker]) for taker in takers[:2])
-            raise InputError(f"{name!r} is of two cameras in {path}, {found}: end each image_prefix with a /")
+            cameras = " and ".join(repr(prefixes[taker]) for taker in takers[:2])
+            raise InputError(f"{name!r} is of two cameras in {path}, {cameras}: end each image_prefix with a /")
         for taker in takers:
             moment = moments.setdefault((taker[0], name.rpartition(prefixes[taker])[2]), {})  # as COLMAP does
             if taker in moment:

@@ -1,7 +1,7 @@
 """Snapshots of a growing model: what a mapping that was killed goes on from.
 
 COLMAP writes a snapshot file by file. When it is whole it moves to a folder of finished ones, under a name that says
-what the model is made from and how many images it has: nothing half-written is ever found there.
+what the model is made from and how many images it has: nothing half-written is ever there.
 """
 
 import hashlib
@@ -25,15 +25,17 @@ class Snapshots:
     """
 
     def __init__(self, folder: Path, growing: Path, made_from: str) -> None:
-        """folder: of finished snapshots, which may be missing. growing: a new folder, on the same disk, that COLMAP
-        writes to. made_from: a fingerprint; snapshots of another one are not used.
+        """Look for snapshots that fit.
+
+        folder: of finished snapshots, which may be missing. growing: a new folder, on the same disk, that COLMAP writes
+        to. made_from: a fingerprint; snapshots of another one are not used.
         """
         self.folder, self.growing, self.made_from = Path(folder), Path(growing), made_from
         self.growing.mkdir()
-        found = {int(path.suffix[1:]): path for path in self.folder.glob(f"{made_from}.*")}
-        self.stored = max(found, default=0)
+        usable = {int(path.suffix[1:]): path for path in self.folder.glob(f"{made_from}.*")}
+        self.stored = max(usable, default=0)
         """Images of the newest snapshot."""
-        self.newest = found.get(self.stored)
+        self.newest = usable.get(self.stored)
         """Its folder, None where there is none."""
         self.registered = 0
         """Images of the model that grows."""
@@ -60,7 +62,7 @@ class Snapshots:
                 shutil.rmtree(older)
 
 
-def digest_inputs(database_path: Path, config: MappingConfig, fix_intrinsics: bool) -> str:
+def digest_inputs(database_path: Path, config: MappingConfig, max_error_px: float, fix_intrinsics: bool) -> str:
     """A fingerprint of all that the incremental mapper starts from: 16 hex digits.
 
     Two-view geometries are left out: they follow from the matches. Raises InputError where there is no database.
@@ -84,4 +86,4 @@ def digest_inputs(database_path: Path, config: MappingConfig, fix_intrinsics: bo
         for pair_id in sorted(database.read_num_matches()[0]):
             digest.update(str(pair_id).encode())
             add(database.read_matches(*pycolmap.pair_id_to_image_pair(pair_id)), np.uint32)
-    return fingerprint(digest.hexdigest(), config, fix_intrinsics, pycolmap.__version__)
+    return fingerprint(digest.hexdigest(), config, max_error_px, fix_intrinsics, pycolmap.__version__)

@@ -1,4 +1,4 @@
-"""Stage 4 and 7: two-view geometry, through pycolmap: which matches agree, and which pairs are convincing.
+"""Two-view geometry, through pycolmap: which matches agree, and which pairs are convincing.
 
 Ctrl-C raises KeyboardInterrupt out of each of these functions within a second or so.
 """
@@ -18,13 +18,13 @@ from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.types import ImagePair, ImageRef, PairMatches, freeze_array
 
 # Fewer matches than this prove nothing about an epipolar geometry.
-FEWEST_MATCHES = 8
+MIN_MATCHES = 8
 
 # verify_pair fits the geometry to at most so many matches and then tests all of them: the time of a trial grows with
 # the matches, the precision of the fit hardly does.
 FIT_MATCHES = 1000
 
-# Enough for 30 % inliers; pairs with more stop earlier, and pairs of different places never need to find anything.
+# Enough for 30 % inliers; pairs with more stop earlier, and pairs of different places need none.
 MAX_TRIALS = 1500
 
 
@@ -42,7 +42,9 @@ class VerifiedPair:
         object.__setattr__(self, "inliers", freeze_array(self.inliers, np.bool_, (None,), "inliers"))
 
 
-def _two_view_options(max_error_px: float, min_inliers: int, min_inlier_ratio: float, seed: int):
+def _two_view_options(
+    max_error_px: float, min_inliers: int, min_inlier_ratio: float, seed: int
+) -> pycolmap.TwoViewGeometryOptions:
     options = pycolmap.TwoViewGeometryOptions()
     options.min_num_inliers = min_inliers
     options.min_inlier_ratio = min_inlier_ratio
@@ -57,22 +59,22 @@ def verify_pair(
     matches: PairMatches,
     camera0: pycolmap.Camera,
     camera1: pycolmap.Camera,
-    max_error_px: float,
-    min_inliers: int,
-    min_inlier_ratio: float,
+    config: VerificationConfig,
+    px_scale: float = 1.0,
     seed: int = 0,
 ) -> np.ndarray:
     """Which matches agree with the two-view geometry of their images.
 
     camera0, camera1: of image 0 and 1; where both have a known focal length, the geometry is calibrated. Pairs that
     see a plane, or that only rotate, are valid: matches then agree with a homography.
-    max_error_px: px of the stored images.
+    px_scale: px of the stored images per px at the matching resolution, the larger of the two.
 
-    Returns (M,) bool, the same for the same seed; all False where fewer than `min_inliers` or a smaller part than
-    `min_inlier_ratio` of the matches agree, and for fewer than 8 matches.
+    Returns (M,) bool, the same for the same seed; all False where fewer than `config.min_inliers` or a smaller part
+    than `config.min_inlier_ratio` of the matches agree, and for fewer than 8 matches. Scores are not looked at.
     """
+    max_error_px = config.max_error_px * px_scale
     rejected = np.zeros(len(matches), dtype=bool)
-    if len(matches) < FEWEST_MATCHES:
+    if len(matches) < MIN_MATCHES:
         return rejected
     xy0 = matches.xy0.astype(np.float64)
     xy1 = matches.xy1.astype(np.float64)
@@ -86,7 +88,7 @@ def verify_pair(
             camera1,
             xy1[chosen],
             identity,
-            _two_view_options(max_error_px, FEWEST_MATCHES, 0.0, seed),
+            _two_view_options(max_error_px, MIN_MATCHES, 0.0, seed),
         )
 
     kinds = pycolmap.TwoViewGeometryConfiguration
@@ -102,7 +104,7 @@ def verify_pair(
         if kind != kinds.CALIBRATED:
             planar = _planar_inliers(xy0, xy1, geometry.H, max_error_px)
             inliers = max(inliers, planar, key=np.count_nonzero)
-    accepted = np.count_nonzero(inliers) >= max(min_inliers, min_inlier_ratio * len(matches))
+    accepted = np.count_nonzero(inliers) >= max(config.min_inliers, config.min_inlier_ratio * len(matches))
     return inliers if accepted else rejected
 
 
@@ -131,8 +133,8 @@ def verify_pairs(
 ) -> dict[ImagePair, VerifiedPair]:
     """verify_pair for many pairs; pairs that are rejected are left out.
 
-    read: gives the matches of a pair. cameras, px_scale: by image name; px of the stored image per px of the
-    matching resolution, in which `config` states the error. quiet: no progress bar.
+    read: gives the matches of a pair. cameras, px_scale: by image name; px_scale is px of the stored image per px at
+    the matching resolution, in which `config` states the error. quiet: no progress bar.
     """
     size_wh = {image.name: image.size_wh for image in images}
     verified = {}
@@ -143,9 +145,8 @@ def verify_pairs(
             matches.select(confident),
             cameras[pair.name0],
             cameras[pair.name1],
-            config.max_error_px * max(px_scale[pair.name0], px_scale[pair.name1]),
-            config.min_inliers,
-            config.min_inlier_ratio,
+            config,
+            max(px_scale[pair.name0], px_scale[pair.name1]),
         )
         if is_convincing(np.count_nonzero(agreeing), len(confident), config):
             inliers = np.zeros(len(matches), dtype=bool)
@@ -158,8 +159,8 @@ def verify_pairs(
 
 def is_convincing(inliers: int, matches: int, config: VerificationConfig) -> bool:
     """Whether so many inliers among so many matches prove that two photos show the same place."""
-    sureness = min(inliers / config.sure_inliers, 1.0)
-    ratio = config.doubtful_inlier_ratio + sureness * (config.min_inlier_ratio - config.doubtful_inlier_ratio)
+    certainty = min(inliers / config.sure_inliers, 1.0)
+    ratio = config.doubtful_inlier_ratio + certainty * (config.min_inlier_ratio - config.doubtful_inlier_ratio)
     return inliers > 0 and inliers >= ratio * matches
 
 
@@ -170,23 +171,19 @@ def measure_cover(xy: np.ndarray, size_wh: tuple[int, int]) -> float:
 
 
 def verify_database(
-    path: Path,
-    max_error_px: float,
-    min_inliers: int,
-    min_inlier_ratio: float,
-    seed: int = 0,
-    num_threads: int = -1,
+    path: Path, config: VerificationConfig, px_scale: float = 1.0, seed: int = 0, num_threads: int = -1
 ) -> None:
     """Estimate the two-view geometry of all matched pairs of a database and store it there, replacing earlier ones.
 
-    max_error_px: px of the stored images. num_threads: -1 takes all cores. Raises InputError where there is no
-    database.
+    px_scale: px of the stored images per px at the matching resolution, in which `config` states the error; the largest
+    of all images. num_threads: -1 takes all cores. Raises InputError where there is no database.
     """
     with open_database(path) as database:
         database.clear_two_view_geometries()  # pycolmap skips pairs that have one
     verifier = pycolmap.GeometricVerifierOptions(num_threads=num_threads)
     # Ctrl-C takes effect between batches.
     pairing = pycolmap.ExistingMatchedPairingOptions(batch_size=4 * (os.cpu_count() or 1))
-    options = _two_view_options(max_error_px, min_inliers, min_inlier_ratio, seed)
+    max_error_px = config.max_error_px * px_scale
+    options = _two_view_options(max_error_px, config.min_inliers, config.min_inlier_ratio, seed)
     with quiet_colmap():
         pycolmap.geometric_verification(path, verifier, pairing, options)

@@ -18,8 +18,9 @@ import numpy as np
 import pycolmap
 from tqdm import tqdm
 
-from hm_sfm.colmap.database import Cameras, make_cameras, open_database, write_database
-from hm_sfm.colmap.mapping import choose_mapper, map_images, summarise_models
+from hm_sfm.colmap.cameras import Cameras, make_cameras
+from hm_sfm.colmap.database import open_database, write_database
+from hm_sfm.colmap.mapping import MappingTask, map_images, summarise_models
 from hm_sfm.colmap.models import read_tracks
 from hm_sfm.colmap.verification import verify_database
 from hm_sfm.config import Config, fingerprint
@@ -168,7 +169,6 @@ def compare(
     check_coarse(config.matching, pairs)
     cameras = make_cameras(listed.images, config.cameras)
     masks = read_masks(listed.images, config.masks)
-    choose_mapper(config.mapping)
     truth = read_truth(ground_truth, names) if ground_truth else None
     matchers = {"persistent": (load_matcher(config), describe_matching(config))}
     matchers["loftr_style"] = load_expectation(expectation_model, config)
@@ -323,21 +323,20 @@ def map_keypoints(
     checks = run.config.verification
     with stopwatch(seconds, "verify"):
         write_database(database, run.images, run.cameras, keypoints, matches)
-        max_error_px = checks.max_error_px * max(measure_px_scales(run.images, run.config).values())
-        verify_database(database, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
+        verify_database(database, checks, max(measure_px_scales(run.images, run.config).values()))
     with (
         stopwatch(seconds, "map"),
         tqdm(total=len(run.images), desc=f"mapping {name}", unit="image", disable=run.quiet) as progress,
     ):
-        map_images(
+        task = MappingTask(
             database,
             run.image_folder,
             database.with_name("sparse"),
-            run.images,
-            run.cameras,
             run.config.mapping,
+            checks.max_error_px,
             on_image=progress.update,
         )
+        map_images(task, run.images, run.cameras)
     return seconds
 
 

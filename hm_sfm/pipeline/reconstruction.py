@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from hm_sfm.colmap.database import Cameras, make_cameras, write_database
-from hm_sfm.colmap.mapping import choose_mapper, map_images, summarise_models
+from hm_sfm.colmap.cameras import Cameras, make_cameras
+from hm_sfm.colmap.database import write_database
+from hm_sfm.colmap.mapping import MappingTask, map_images, summarise_models
 from hm_sfm.colmap.rigs import expand_pairs, read_rigs
 from hm_sfm.colmap.verification import VerifiedPair, verify_database, verify_pairs
 from hm_sfm.config import Config, fingerprint
@@ -91,7 +92,6 @@ def match_photos(
     check_coarse(config.matching, pairs)
     cameras = make_cameras(images, config.cameras)
     masks = read_masks(images, config.masks)  # all bad input is found before anything is computed
-    choose_mapper(config.mapping)
     claim_folder(out, shared=shard is not None)
     if shard:
         shard.lock(out)
@@ -142,12 +142,7 @@ def write_verified(
     """write_database, then the two-view geometries of all its pairs; adds to the seconds of `matched`."""
     with stopwatch(matched.seconds, "verify"):
         write_database(path, matched.images, matched.cameras, keypoints, matches)
-        verify_database(
-            path,
-            config.verification.max_error_px * max(measure_px_scales(matched.images, config).values()),
-            config.verification.min_inliers,
-            config.verification.min_inlier_ratio,
-        )
+        verify_database(path, config.verification, max(measure_px_scales(matched.images, config).values()))
 
 
 @release_locks()
@@ -201,15 +196,15 @@ def reconstruct(image_folder: Path, out: Path, config: Config, quiet: bool = Fal
         stopwatch(matched.seconds, "map"),
         tqdm(total=len(matched.images), desc="mapping", unit="image", disable=quiet) as progress,
     ):
-        models = map_images(
+        task = MappingTask(
             out / "database.db",
             Path(image_folder),
             out / "sparse",
-            matched.images,
-            matched.cameras,
             config.mapping,
+            config.verification.max_error_px,
             on_image=progress.update,
         )
+        models = map_images(task, matched.images, matched.cameras)
     result = summarise_models(models, len(matched.images))
     matched.seconds["total"] = time.monotonic() - started
     diagnoses = diagnose(

@@ -14,7 +14,8 @@ import h5py
 import numpy as np
 import pycolmap
 
-from hm_sfm.colmap.database import Cameras, open_database, read_verified_matches
+from hm_sfm.colmap.cameras import Cameras
+from hm_sfm.colmap.database import open_database, read_verified_matches
 from hm_sfm.config import Config
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.formats.hloc import name_group

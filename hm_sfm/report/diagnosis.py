@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from hm_sfm.colmap.database import Cameras, open_database, read_verified_matches
+from hm_sfm.colmap.cameras import Cameras
+from hm_sfm.colmap.database import open_database, read_verified_matches
 from hm_sfm.config import Config
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 

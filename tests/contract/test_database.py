@@ -7,7 +7,8 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from hm_sfm.colmap.database import Cameras, make_cameras, open_database, write_database
+from hm_sfm.colmap.cameras import Cameras, make_cameras
+from hm_sfm.colmap.database import open_database, write_database
 from hm_sfm.config import CameraConfig
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.photos.exif import write_jpeg

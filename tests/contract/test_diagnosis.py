@@ -7,9 +7,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hm_sfm.colmap.database import Cameras, write_database
+from hm_sfm.colmap.cameras import Cameras
+from hm_sfm.colmap.database import write_database
 from hm_sfm.colmap.verification import verify_database
-from hm_sfm.config import Config, ImageConfig
+from hm_sfm.config import Config, ImageConfig, VerificationConfig
 from hm_sfm.errors import InputError
 from hm_sfm.pairs.selection import pair_exhaustively
 from hm_sfm.report.diagnosis import MOST_LISTED, Cause, Diagnosis, diagnose
@@ -158,7 +159,7 @@ def test_the_same_view_twice_has_no_baseline(tmp_path):
     cameras = Cameras((camera,), (0, 0))
     path = tmp_path / "database.db"
     write_database(path, images, cameras, keypoints, [matches])
-    verify_database(path, 3.0, 30, 0.25, num_threads=1)
+    verify_database(path, VerificationConfig(), num_threads=1)
     (found,) = diagnose(images, cameras, [pair], Run.read, path, (), Config())
     assert found.cause == Cause.SMALL_BASELINE
     assert found.reasons["a.jpg"] == "rays meet at 0.0 degrees at most, focal length unknown"

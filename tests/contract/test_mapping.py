@@ -1,5 +1,6 @@
 """What hm_sfm.colmap.mapping makes of oracle scenes: cameras, points and keypoints known, matches exact or wrong."""
 
+import dataclasses
 import shutil
 import signal
 import subprocess
@@ -12,12 +13,13 @@ import pycolmap
 import pytest
 
 import hm_sfm.colmap.mapping
-from hm_sfm.colmap.database import Cameras, open_database, write_database
-from hm_sfm.colmap.mapping import choose_mapper, map_globally, map_images, map_incrementally, summarise_models
+from hm_sfm.colmap.cameras import Cameras
+from hm_sfm.colmap.database import open_database, write_database
+from hm_sfm.colmap.mapping import MappingTask, map_globally, map_images, map_incrementally, summarise_models
 from hm_sfm.colmap.snapshots import digest_inputs
 from hm_sfm.colmap.verification import is_convincing, verify_database, verify_pair, verify_pairs
 from hm_sfm.config import MappingConfig, VerificationConfig
-from hm_sfm.errors import ConfigError, InputError
+from hm_sfm.errors import InputError
 from hm_sfm.formats.hloc import read_features, read_matches, write_features, write_matches
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints, PairMatches
 
@@ -77,7 +79,7 @@ def make_unknown_camera(oracle: Oracle) -> pycolmap.Camera:
 def write_and_verify(folder: Path, oracle: Oracle, camera: pycolmap.Camera) -> Path:
     path = folder / "database.db"
     write_database(path, oracle.images, Cameras((camera,), (0,) * len(oracle.images)), oracle.keypoints, oracle.matches)
-    verify_database(path, max_error_px=3.0, min_inliers=30, min_inlier_ratio=0.25, num_threads=1)
+    verify_database(path, VerificationConfig(), num_threads=1)
     return path
 
 
@@ -99,7 +101,7 @@ def test_model_equals_the_oracle(tmp_path, oracle, known):
     path = write_and_verify(tmp_path, oracle, camera)
     registered = []
     models = map_incrementally(
-        path, tmp_path, tmp_path / "sparse", MappingConfig(), known, on_image=lambda: registered.append(1)
+        MappingTask(path, tmp_path, tmp_path / "sparse", fix_intrinsics=known, on_image=lambda: registered.append(1))
     )
     assert len(models) == 1
     assert_same_up_to_similarity(models[0], oracle.model)
@@ -121,10 +123,26 @@ def test_intrinsics_stay_as_given_even_where_they_are_wrong(tmp_path, oracle):
     camera = make_known_camera(oracle)
     camera.focal_length *= 1.002
     path = write_and_verify(tmp_path, oracle, camera)
-    fixed = map_incrementally(path, tmp_path, tmp_path / "fixed", MappingConfig(), fix_intrinsics=True)
-    free = map_incrementally(path, tmp_path, tmp_path / "free", MappingConfig(), fix_intrinsics=False)
+    fixed = map_incrementally(MappingTask(path, tmp_path, tmp_path / "fixed", fix_intrinsics=True))
+    free = map_incrementally(MappingTask(path, tmp_path, tmp_path / "free"))
     np.testing.assert_array_equal(fixed[0].cameras[1].params, camera.params)
     assert abs(free[0].cameras[1].focal_length - camera.focal_length) > 1.0
+
+
+def test_observations_beyond_the_error_of_verification_are_dropped(tmp_path, oracle):
+    rng = np.random.default_rng(0)
+    noisy = [
+        dataclasses.replace(points, xy=points.xy + rng.normal(0, 0.5, points.xy.shape)) for points in oracle.keypoints
+    ]
+    path = write_and_verify(
+        tmp_path, Oracle(oracle.model, oracle.images, noisy, oracle.matches), make_known_camera(oracle)
+    )
+    observations = []
+    for max_error_px in (3.0, 0.5):
+        task = MappingTask(path, tmp_path, tmp_path / "sparse", max_error_px=max_error_px, fix_intrinsics=True)
+        (model,) = map_incrementally(task)
+        observations.append(model.compute_num_observations())
+    assert 0 < observations[1] < 0.8 * observations[0]
 
 
 def test_disjoint_scenes_give_two_models_largest_first(tmp_path):
@@ -137,7 +155,7 @@ def test_disjoint_scenes_give_two_models_largest_first(tmp_path):
     path = write_and_verify(tmp_path, both, make_known_camera(large))
     sparse = tmp_path / "sparse"
     (sparse / "7").mkdir(parents=True)  # of an earlier run
-    models = map_incrementally(path, tmp_path, sparse, MappingConfig(), fix_intrinsics=True)
+    models = map_incrementally(MappingTask(path, tmp_path, sparse, fix_intrinsics=True))
     names = [{image.name.split("/")[0] for image in model.images.values()} for model in models]
     assert names == [{"large"}, {"small"}]
     assert [model.num_reg_images() for model in models] == [6, 4]
@@ -155,9 +173,9 @@ def test_nothing_to_map_gives_no_model(tmp_path, oracle, with_matches):
     camera = make_known_camera(oracle)
     write_database(path, oracle.images, Cameras((camera,), (0,) * 6), oracle.keypoints, matches)
     if not with_matches:
-        verify_database(path, 3.0, 30, 0.25)
+        verify_database(path, VerificationConfig())
     (tmp_path / "sparse" / "0").mkdir(parents=True)
-    assert map_incrementally(path, tmp_path, tmp_path / "sparse", MappingConfig(), False) == ()
+    assert map_incrementally(MappingTask(path, tmp_path, tmp_path / "sparse")) == ()
     assert [entry.name for entry in tmp_path.iterdir()] == ["database.db"]
 
     result = summarise_models((), num_images=6)
@@ -178,7 +196,7 @@ def test_ctrl_c_leaves_the_earlier_models_and_nothing_else(tmp_path, oracle):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            map_incrementally(path, tmp_path, tmp_path / "sparse", MappingConfig(), True, on_image=interrupt)
+            map_incrementally(MappingTask(path, tmp_path, tmp_path / "sparse", fix_intrinsics=True, on_image=interrupt))
     finally:
         signal.signal(signal.SIGINT, before)
     assert len(registered) == 1
@@ -190,7 +208,7 @@ def test_colmap_keeps_quiet(tmp_path, oracle, capfd):
     level = pycolmap.logging.minloglevel
     pycolmap.logging.info("a message to see that messages are captured")
     path = write_and_verify(tmp_path, oracle, make_known_camera(oracle))
-    map_incrementally(path, tmp_path, tmp_path / "sparse", MappingConfig(), True)
+    map_incrementally(MappingTask(path, tmp_path, tmp_path / "sparse", fix_intrinsics=True))
     lines = "".join(capfd.readouterr()).splitlines()
     assert len(lines) == 1 and lines[0].endswith("a message to see that messages are captured")
     assert pycolmap.logging.minloglevel == level
@@ -198,9 +216,9 @@ def test_colmap_keeps_quiet(tmp_path, oracle, capfd):
 
 def test_missing_database_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="missing.db"):
-        verify_database(tmp_path / "missing.db", 3.0, 30, 0.25)
+        verify_database(tmp_path / "missing.db", VerificationConfig())
     with pytest.raises(InputError, match="missing.db"):
-        map_incrementally(tmp_path / "missing.db", tmp_path, tmp_path / "sparse", MappingConfig(), False)
+        map_incrementally(MappingTask(tmp_path / "missing.db", tmp_path, tmp_path / "sparse"))
     assert not list(tmp_path.iterdir())
 
 
@@ -210,7 +228,6 @@ KILLED_MAPPING = """
 import os, signal, sys
 from pathlib import Path
 from hm_sfm.colmap import mapping
-from hm_sfm.config import MappingConfig
 
 mapping.SNAPSHOT_IMAGES = 3
 registered = []
@@ -221,7 +238,10 @@ def kill_at_nine():
         os.kill(os.getpid(), signal.SIGKILL)
 
 folder = Path(sys.argv[1])
-mapping.map_incrementally(folder / "database.db", folder, folder / "sparse", MappingConfig(), True, kill_at_nine)
+task = mapping.MappingTask(
+    folder / "database.db", folder, folder / "sparse", fix_intrinsics=True, on_image=kill_at_nine
+)
+mapping.map_incrementally(task)
 """
 
 
@@ -257,7 +277,7 @@ def test_a_killed_mapping_goes_on_from_its_newest_snapshot(tmp_path, inputs_of_m
     path = write_and_verify(folder, oracle, make_known_camera(oracle))  # as reconstruct does
     registered = []
     models = map_incrementally(
-        path, folder, folder / "sparse", MappingConfig(), True, on_image=lambda: registered.append(1)
+        MappingTask(path, folder, folder / "sparse", fix_intrinsics=True, on_image=lambda: registered.append(1))
     )
     assert inputs_of_mapper == [snapshot]
     assert len(models) == 1 and len(registered) == 12
@@ -265,23 +285,26 @@ def test_a_killed_mapping_goes_on_from_its_newest_snapshot(tmp_path, inputs_of_m
     assert sorted(entry.name for entry in folder.iterdir()) == ["database.db", "sparse"]
 
     # Not with another configuration.
-    (model,) = map_incrementally(other / "database.db", other, other / "sparse", MappingConfig(seed=1), True)
+    (model,) = map_incrementally(
+        MappingTask(other / "database.db", other, other / "sparse", MappingConfig(seed=1), fix_intrinsics=True)
+    )
     assert inputs_of_mapper[1:] == [""] and model.num_reg_images() == 12
     assert sorted(entry.name for entry in other.iterdir()) == ["database.db", "sparse"]
 
 
 def test_what_snapshots_are_made_from(tmp_path, oracle):
     path = write_and_verify(tmp_path, oracle, make_known_camera(oracle))
-    first = digest_inputs(path, MappingConfig(), True)
-    assert digest_inputs(path, MappingConfig(min_model_size=3), True) != first
-    assert digest_inputs(path, MappingConfig(), False) != first
+    first = digest_inputs(path, MappingConfig(), 3.0, True)
+    assert digest_inputs(path, MappingConfig(min_model_size=3), 3.0, True) != first
+    assert digest_inputs(path, MappingConfig(), 3.0, False) != first
+    assert digest_inputs(path, MappingConfig(), 2.9, True) != first
     write_and_verify(tmp_path, oracle, make_unknown_camera(oracle))
-    assert digest_inputs(path, MappingConfig(), True) != first
+    assert digest_inputs(path, MappingConfig(), 3.0, True) != first
     write_and_verify(tmp_path, oracle, make_known_camera(oracle))
-    assert digest_inputs(path, MappingConfig(), True) == first
+    assert digest_inputs(path, MappingConfig(), 3.0, True) == first
     with open_database(path) as database:
         database.delete_matches(1, 2)
-    assert digest_inputs(path, MappingConfig(), True) != first
+    assert digest_inputs(path, MappingConfig(), 3.0, True) != first
 
 
 # Other mappers
@@ -305,7 +328,9 @@ def test_the_global_mapper_builds_the_oracle(tmp_path, oracle, known, capfd):
     cameras = Cameras((camera,), (0,) * 6, known=known)
     capfd.readouterr()
     models = map_images(
-        path, tmp_path, tmp_path / "sparse", oracle.images, cameras, config, lambda: registered.append(1)
+        MappingTask(path, tmp_path, tmp_path / "sparse", config, on_image=lambda: registered.append(1)),
+        oracle.images,
+        cameras,
     )
     assert capfd.readouterr().err == ""
     assert read_geometry(path) == before
@@ -323,7 +348,7 @@ def test_the_global_mapper_builds_the_oracle(tmp_path, oracle, known, capfd):
 def test_the_global_mapper_without_matches_gives_no_model(tmp_path, oracle):
     path = tmp_path / "database.db"
     write_database(path, oracle.images, Cameras((make_known_camera(oracle),), (0,) * 6), oracle.keypoints, [])
-    assert map_globally(path, tmp_path, tmp_path / "sparse", MappingConfig(), False) == ()
+    assert map_globally(MappingTask(path, tmp_path, tmp_path / "sparse")) == ()
     assert not (tmp_path / "sparse").exists()
 
 
@@ -347,7 +372,9 @@ def test_known_poses_are_kept_and_points_triangulated(tmp_path):
     config = MappingConfig(mapper="global")  # has nothing to say
     registered = []
     sparse = tmp_path / "sparse"
-    models = map_images(path, tmp_path, sparse, oracle.images, cameras, config, lambda: registered.append(1))
+    models = map_images(
+        MappingTask(path, tmp_path, sparse, config, on_image=lambda: registered.append(1)), oracle.images, cameras
+    )
     assert len(models) == 1 and len(registered) == 6
     stored = pycolmap.Reconstruction(sparse / "0")
     assert {image.name for image in stored.images.values()} == {image.name for image in oracle.images}
@@ -370,14 +397,9 @@ def test_wrong_poses_give_no_model(tmp_path, oracle):
     )
     wrong = Cameras(cameras.cameras, cameras.camera_index, known=True, cam_from_world=backwards)
     path = write_and_verify(tmp_path, oracle, cameras.cameras[0])
-    models = map_images(path, tmp_path, tmp_path / "sparse", oracle.images, wrong, MappingConfig())
+    models = map_images(MappingTask(path, tmp_path, tmp_path / "sparse"), oracle.images, wrong)
     assert sum(model.num_points3D() for model in models) < 30
     assert bool(models) == (tmp_path / "sparse").exists()
-
-
-def test_a_mapper_that_does_not_exist():
-    with pytest.raises(ConfigError, match="mapping.mapper must be incremental or global, found 'hierarchical'"):
-        choose_mapper(MappingConfig(mapper="hierarchical"))
 
 
 def test_verification_replaces_earlier_geometries_and_drops_planted_outliers(tmp_path, oracle):
@@ -391,16 +413,16 @@ def test_verification_replaces_earlier_geometries_and_drops_planted_outliers(tmp
     with pycolmap.Database.open(path) as database:
         database.delete_matches(id0, id1)
         database.write_matches(id0, id1, wrong)
-    verify_database(path, 1.0, 30, 0.25, num_threads=1)
+    verify_database(path, VerificationConfig(max_error_px=1.0), num_threads=1)
     with pycolmap.Database.open(path) as database:
         inliers = {tuple(row) for row in database.read_two_view_geometry(id0, id1).inlier_matches.tolist()}
     assert {tuple(row) for row in wrong[20:].tolist()} <= inliers
     assert len(inliers & {tuple(row) for row in wrong[:20].tolist()}) <= 2  # a wrong one may lie on its epipolar line
 
-    verify_database(path, 1.0, min_inliers=10_000, min_inlier_ratio=0.25, num_threads=1)
+    verify_database(path, VerificationConfig(max_error_px=1.0, min_inliers=10_000), num_threads=1)
     with pycolmap.Database.open(path) as database:
         assert database.num_inlier_matches() == 0
-    assert map_incrementally(path, tmp_path, tmp_path / "sparse", MappingConfig(), True) == ()
+    assert map_incrementally(MappingTask(path, tmp_path, tmp_path / "sparse", fix_intrinsics=True)) == ()
 
 
 def test_track_length_counts_distinct_images(oracle):
@@ -466,38 +488,42 @@ def test_planted_outliers_are_found(num_matches, shape, prior):
     # wrong matches, and a fundamental matrix or a homography fits distorted images only roughly.
     tolerance = 0.0 if prior and shape == "deep" else 0.04
     pair, camera, right = make_pair(num_matches, 0.3, prior, shape)
-    mask = verify_pair(pair, camera, camera, 3.0, 30, 0.25)
+    mask = verify_pair(pair, camera, camera, VerificationConfig())
     assert mask.shape == (num_matches,) and mask.dtype == bool
     assert np.mean(mask != right) <= tolerance
-    np.testing.assert_array_equal(mask, verify_pair(pair, camera, camera, 3.0, 30, 0.25))
+    np.testing.assert_array_equal(mask, verify_pair(pair, camera, camera, VerificationConfig()))
 
 
 def test_a_dominant_plane_does_not_cost_what_stands_before_it():
     planar, camera, _ = make_pair(400, 0.0, True, "planar")
     deep, _, _ = make_pair(40, 0.0, True, "deep")
     both = make_matches(np.concatenate([planar.xy0, deep.xy0]), np.concatenate([planar.xy1, deep.xy1]))
-    assert verify_pair(both, camera, camera, 1.0, 30, 0.25).all()
+    assert verify_pair(both, camera, camera, VerificationConfig(max_error_px=1.0)).all()
 
 
 def test_pairs_below_the_limits_are_rejected():
     pair, camera, right = make_pair(200, 0.3, True)
     count = int(right.sum())
-    assert verify_pair(pair, camera, camera, 3.0, count, count / 200).sum() == count
-    assert not verify_pair(pair, camera, camera, 3.0, count + 1, 0.25).any()
-    assert not verify_pair(pair, camera, camera, 3.0, 30, (count + 1) / 200).any()
+
+    def limit(min_inliers: int, min_inlier_ratio: float) -> VerificationConfig:
+        return VerificationConfig(min_inliers=min_inliers, min_inlier_ratio=min_inlier_ratio)
+
+    assert verify_pair(pair, camera, camera, limit(count, count / 200)).sum() == count
+    assert not verify_pair(pair, camera, camera, limit(count + 1, 0.25)).any()
+    assert not verify_pair(pair, camera, camera, limit(30, (count + 1) / 200)).any()
 
 
 def test_random_matches_are_rejected():
     rng = np.random.default_rng(0)
     _, camera, _ = make_pair(10, 0.0, True)
     matches = make_matches(*rng.uniform((0, 0), SIZE_WH, (2, 500, 2)))
-    assert not verify_pair(matches, camera, camera, 3.0, 30, 0.25).any()
+    assert not verify_pair(matches, camera, camera, VerificationConfig()).any()
 
 
 @pytest.mark.parametrize("count", [0, 1, 7])
 def test_too_few_matches_are_rejected(count):
     pair, camera, _ = make_pair(count, 0.0, True)
-    mask = verify_pair(pair, camera, camera, 3.0, 0, 0.0)
+    mask = verify_pair(pair, camera, camera, VerificationConfig(min_inliers=0, min_inlier_ratio=0.0))
     assert mask.shape == (count,) and not mask.any()
 
 
@@ -543,7 +569,7 @@ def test_oracle_matches_through_hlocs_files_give_the_oracles_model(tmp_path, ora
     matches = list(read_matches(tmp_path / "matches.h5", pairs, keypoints))
     read = Oracle(oracle.model, oracle.images, keypoints, matches)
     path = write_and_verify(tmp_path, read, make_known_camera(oracle))
-    (model,) = map_incrementally(path, tmp_path, tmp_path / "sparse", MappingConfig(), fix_intrinsics=True)
+    (model,) = map_incrementally(MappingTask(path, tmp_path, tmp_path / "sparse", fix_intrinsics=True))
     assert_same_up_to_similarity(model, oracle.model)
     assert summarise_models([model], 6).mean_reprojection_px < 0.01
 

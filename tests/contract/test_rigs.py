@@ -10,11 +10,12 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hm_sfm.colmap.database import Cameras, make_cameras, open_database, write_database
-from hm_sfm.colmap.mapping import map_images
+from hm_sfm.colmap.cameras import Cameras, make_cameras
+from hm_sfm.colmap.database import open_database, write_database
+from hm_sfm.colmap.mapping import MappingTask, map_images
 from hm_sfm.colmap.rigs import lack_poses, read_rigs
 from hm_sfm.colmap.verification import verify_database
-from hm_sfm.config import CameraConfig, Config, MappingConfig, PairConfig
+from hm_sfm.config import CameraConfig, Config, MappingConfig, PairConfig, VerificationConfig
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.photos.exif import write_jpeg
 from hm_sfm.pipeline.reconstruction import choose_pairs
@@ -96,8 +97,8 @@ def map_oracle(
 ) -> tuple[pycolmap.Reconstruction, ...]:
     path = folder / "database.db"
     write_database(path, oracle.images, cameras, oracle.keypoints, oracle.matches)
-    verify_database(path, max_error_px=3.0, min_inliers=15, min_inlier_ratio=0.25, num_threads=1)
-    return map_images(path, folder, folder / "sparse", oracle.images, cameras, config)
+    verify_database(path, VerificationConfig(min_inliers=15), num_threads=1)
+    return map_images(MappingTask(path, folder, folder / "sparse", config), oracle.images, cameras)
 
 
 def assert_is_the_rig(rigs: list[pycolmap.Rig], oracle: Oracle, scale_is_known: bool) -> None:

@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from hm_sfm.colmap.database import make_cameras
+from hm_sfm.colmap.cameras import make_cameras
 from hm_sfm.config import CameraConfig
 from hm_sfm.errors import InputError, MissingPackageError
 from hm_sfm.photos.bitmaps import open_to_colmap, read_bitmap

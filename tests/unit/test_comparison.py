@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from hm_sfm.colmap.database import Cameras
+from hm_sfm.colmap.cameras import Cameras
 from hm_sfm.config import Config, MappingConfig
 from hm_sfm.evaluation.comparison import (
     Method,

@@ -11,7 +11,8 @@ import pycolmap
 import pytest
 from plyfile import PlyData
 
-from hm_sfm.colmap.database import Cameras, write_database
+from hm_sfm.colmap.cameras import Cameras
+from hm_sfm.colmap.database import write_database
 from hm_sfm.errors import InputError
 from hm_sfm.export.conversion import convert_run, flatten_names
 from hm_sfm.formats.pairs_files import write_pairs

@@ -1,4 +1,7 @@
-"""Matching by the workers of a local Ray cluster: the same matches, also where a worker is lost."""
+"""Matching by the workers of a local Ray cluster: the same matches, also where a worker is lost.
+
+A worker computes with one thread, and so does the process that it is compared with: test_threads.py has what more change.
+"""
 
 import sys
 from pathlib import Path
@@ -44,7 +47,7 @@ def mortal(monkeypatch, tmp_path) -> Path:
 
 
 def test_a_cluster_that_loses_a_worker_matches_as_one_process_does(
-    cluster, mortal, tiny_photos, tmp_path, run, read_matches, matched_pairs
+    cluster, mortal, one_thread, tiny_photos, tmp_path, run, read_matches, matched_pairs
 ):
     assert run("match", tiny_photos, tmp_path / "serial").code == 0
     assert len(matched_pairs) == 15

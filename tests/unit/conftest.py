@@ -34,15 +34,6 @@ def write_xfeat(path: Path) -> Path:
 
 
 @pytest.fixture
-def one_thread():
-    """Sums of several threads differ in the last bit from run to run."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-@pytest.fixture
 def training(tmp_path, one_thread, monkeypatch) -> TrainConfig:
     """Six steps of one pair, validated on four pairs after every third one, saved after each; no pictures."""
     monkeypatch.setattr(loop, "HELD_OUT_PAIRS", 4)

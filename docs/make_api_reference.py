@@ -21,10 +21,10 @@ PACKAGES = (
 """In the order in which they are worth reading: the way of the data."""
 HEADER = """# Python API
 
-Made from the docstrings by `python docs/make_api_reference.py`.
+Made from the docstrings by `make docs`.
 
 All coordinates are px in COLMAP's frame: the centre of the top-left pixel is (0.5, 0.5). Where images are concerned,
-they are those of the stored photo, unrotated and in full size. Examples are in the [README](../README.md#python) and in
+they are those of the stored photo, unrotated and in full size. Examples are in the [python.md](python.md) and in
 [pipelines/examples/](../pipelines/examples).
 """
 

@@ -26,6 +26,8 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = {path.name: path.read_text() for path in sorted(DOCS.glob("*.md")) if path.name != "api.md"}  # api.md is built
 WRITTEN = sorted(PAGES.keys() - {"README.md", "ablations.md"})
+OTHER_PROGRAMS = {"--nproc-per-node", "--editable", "--scaling"}
+"""Options of torchrun, pip and pipelines/benchmarks/benchmark_costs.py."""
 CHEAP = ("show", "convert", "frames", "export")
 """Commands that are run here; of the others, only the arguments are checked."""
 
@@ -46,26 +48,36 @@ def test_the_index_has_a_line_for_each_page():
     assert sorted(linked) == sorted(PAGES.keys() - {"README.md"})
 
 
+def list_subparsers() -> dict[str, argparse.ArgumentParser]:
+    return next(a for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
+
+
 @pytest.mark.parametrize("page", WRITTEN)
 def test_all_commands_parse(page):
-    commands = list_commands(page)
-    assert commands
-    for command in commands:
+    for command in list_commands(page):
         make_parser().parse_args(command)
-    # Also those within a sentence.
-    for line in re.findall(r"`hm-sfm ([^`]*--[^`]*)`", PAGES[page]):
+
+
+def test_commands_within_a_sentence_parse_as_far_as_they_go():
+    lines = [line for page in WRITTEN for line in re.findall(r"(?<!\| )`hm-sfm ([a-z][^`]*--[^`]*)`", PAGES[page])]
+    assert len(lines) > 5
+    for line in lines:
         try:
             make_parser().parse_args(shlex.split(line))
         except InputError as error:
-            assert "the following arguments are required" in str(error), line
+            assert "the following arguments are required" in str(error), line  # noqa: PT017
+
+
+def test_the_table_of_commands_is_complete():
+    rows = re.findall(r"^\| `hm-sfm ([a-z]+)", PAGES["commands.md"], re.MULTILINE)
+    assert rows == list(list_subparsers())
 
 
 @pytest.mark.parametrize("page", WRITTEN)
 def test_all_options_settings_and_files_are_there(page):
     text = PAGES[page]
-    subparsers = next(a for a in make_parser()._actions if isinstance(a, argparse._SubParsersAction))
-    known = {flag for command in subparsers.choices.values() for flag in command._option_string_actions}
-    assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)) - {"--nproc-per-node", "--editable"} <= known
+    known = {flag for command in list_subparsers().values() for flag in command._option_string_actions}
+    assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)) - OTHER_PROGRAMS <= known
     for setting in re.findall(r"--set ([\w.]+)=", text):
         section, _, key = setting.partition(".")
         assert key in yaml.safe_load((ROOT / "configs" / "light.yaml").read_text())[section], setting
@@ -94,6 +106,26 @@ def test_the_cheap_commands_run(scene, out, tmp_path, monkeypatch, run, matched_
     assert len(matched_pairs) == 1  # by show; everything else was there
     (frame,) = Path("photos/walk").glob("*.jpg")
     assert re.fullmatch(r"walk_\d{8}\.jpg", frame.name)
+
+
+def test_the_python_example_runs(scene, reconstructed, tmp_path, monkeypatch, matched_pairs):
+    (example,) = code_blocks("python.md", "python")
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(scene.images, "photos")
+    shutil.copy("photos/view_00.jpg", "a.jpg")
+    shutil.copy("photos/view_01.jpg", "b.jpg")
+    shutil.copytree(reconstructed, "out/castle")
+
+    names: dict = {}
+    exec(example, names)
+
+    assert len(matched_pairs) == 1
+    matches = names["matches"]
+    assert len(matches) > 100
+    assert names["valid"].any()
+    assert np.isfinite(names["xy_b"][names["valid"]]).all()
+    assert len(names["dense_a"]) == len(names["dense_b"]) > len(matches)
+    assert names["model"].num_reg_images() == names["result"].registered == 5
 
 
 def test_the_python_example_of_hloc_runs(scene, out, tmp_path, monkeypatch, run):

@@ -6,7 +6,6 @@ import hashlib
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +31,6 @@ class Finished:
     code: int
     out: str
     err: str
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -52,10 +50,9 @@ def spawn() -> Callable[..., Finished]:
     """Run hm-sfm in a process of its own, as a user does."""
 
     def run_there(*arguments: object) -> Finished:
-        started = time.monotonic()
         command = [sys.executable, "-m", "hm_sfm.cli", *map(str, arguments)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=600)
-        return Finished(done.returncode, done.stdout, done.stderr, time.monotonic() - started)
+        return Finished(done.returncode, done.stdout, done.stderr)
 
     return run_there
 
@@ -68,13 +65,12 @@ def run(capfd) -> Callable[..., Finished]:
         # What C++ libraries printed in earlier tests may still wait in C's own buffer.
         ctypes.CDLL(None).fflush(None)
         capfd.readouterr()
-        started = time.monotonic()
         try:
             code = main([str(argument) for argument in arguments])
         except SystemExit as stop:  # argparse, after --help and --version
             code = stop.code
         out, err = capfd.readouterr()
-        return Finished(code, out, err, time.monotonic() - started)
+        return Finished(code, out, err)
 
     return run_here
 

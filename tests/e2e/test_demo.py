@@ -105,7 +105,6 @@ def test_demo_matches_are_found_again(demo, run, matched_pairs):
     before = (out / "matches.h5").stat().st_mtime_ns
     finished = run("match", out / "images", out)
     assert finished.code == 0
-    assert finished.seconds < 20
     assert matched_pairs == []
     assert (out / "matches.h5").stat().st_mtime_ns == before
 

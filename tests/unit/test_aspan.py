@@ -34,7 +34,7 @@ from hm_sfm.network.coarse import AspanCoarse
 from hm_sfm.network.homonet import HomoNet
 from hm_sfm.training import loop
 from hm_sfm.training.loop import TrainConfig, train
-from hm_sfm.training.losses import FLOW_WEIGHT, measure_coarse_loss, measure_flow_loss
+from hm_sfm.training.losses import CORNER_WEIGHT, FLOW_WEIGHT, SCALE_WEIGHT, measure_coarse_loss, measure_flow_loss
 from hm_sfm.training.supervision import CoarseSupervision
 
 
@@ -366,9 +366,12 @@ def test_the_loop_trains_it_by_matches_and_flow(training, stage):
         rows = list(csv.DictReader(file))
     assert len(rows) == 2
     for row in rows:
-        parts = float(row["coarse"]) + FLOW_WEIGHT * float(row["flow"])
-        assert float(row["coarse"]) > 0 and float(row["flow"]) != 0
-        assert float(row["loss"]) == pytest.approx(parts, rel=1e-4) or stage == "joint"
+        value = {name: float(text) for name, text in row.items()}
+        assert value["coarse"] > 0 and value["flow"] != 0
+        loss = value["coarse"] + FLOW_WEIGHT * value["flow"]
+        if stage == "joint":
+            loss += value["dense"] + CORNER_WEIGHT * value["corner"] + SCALE_WEIGHT * value["scale"] + value["point"]
+        assert value["loss"] == pytest.approx(loss, rel=1e-4)
     assert load_weights(str(path)).config.coarse == "aspan"
 
 

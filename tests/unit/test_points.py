@@ -1,6 +1,7 @@
 """Point errors of matches that are planted, and the command around them."""
 
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -73,7 +74,13 @@ def test_exact_homographies_have_no_error():
     # 16 cells in the last columns and one in the hole cannot be right.
     assert scores["all_correct_3px"] == scores["all_correct_1px"] == pytest.approx(100 * 79 / 96)
     assert scores["all_coverage"] == 100
-    assert scores["milliseconds"] >= 0
+
+
+def test_the_milliseconds_are_the_median_time_of_matching(monkeypatch):
+    clock = iter([0.0, 0.25, 1.0, 1.5, 7.0, 8.0])
+    monkeypatch.setattr("hm_sfm.evaluation.points.time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    item = make_item()
+    assert score(PlantedMatcher(item), [item, item, item])["milliseconds"] == 500
 
 
 def test_points_beyond_an_edge_follow_their_own_surface():
@@ -117,7 +124,7 @@ def test_coverage_counts_cells_once_and_visible_ones_only():
     assert score(PlantedMatcher(item, shift=(4, 0)), [item])["all_coverage"] == 0
 
 
-def test_no_matches_give_figures_without_errors():
+def test_no_matches_give_metrics_without_errors():
     item = make_item()
     scores = score(PlantedMatcher(item, cells=slice(0)), [item])
     assert scores["all_mean_matches"] == 0 and scores["all_coverage"] == 0
@@ -164,8 +171,9 @@ def test_unknown_validation_pairs_are_refused(kind, count, text):
 # The command
 
 
-@pytest.mark.parametrize("kind", ["rendered", "warped"])
-def test_evaluate_points_prints_writes_and_draws(tmp_path, capsys, kind):
+# A warp of the one held-out photo shows it four times, and nothing tells which of them is the right one.
+@pytest.mark.parametrize(("kind", "least_percent"), [("rendered", 70), ("warped", 20)])
+def test_evaluate_points_prints_writes_and_draws(tmp_path, capsys, kind, least_percent):
     photos = tmp_path / "photos"
     photos.mkdir()
     for seed in range(3):
@@ -173,13 +181,12 @@ def test_evaluate_points_prints_writes_and_draws(tmp_path, capsys, kind):
     pictures, scores = tmp_path / "new" / "pictures", tmp_path / "scores.json"
     command = ["evaluate", "points", photos, "--kind", kind, "--count", 1, "--quiet"]
     assert main([str(word) for word in (*command, "--pictures", pictures, "--json", scores)]) == 0
-    figures = json.loads(scores.read_text())
+    metrics = json.loads(scores.read_text())
     printed = capsys.readouterr().out
-    assert all(name in printed for name in figures)
-    assert figures["all_mean_matches"] >= figures["trusted_mean_matches"]
-    assert figures["all_mean_matches"] > 100
-    # A warp of the one held-out photo shows it four times, and nothing tells which one is meant.
-    assert kind == "warped" or figures["all_centres_median_px"] < 5
+    assert all(name in printed for name in metrics)
+    assert metrics["all_mean_matches"] >= metrics["trusted_mean_matches"]
+    assert metrics["all_mean_matches"] > 100
+    assert metrics["trusted_correct_1px"] > least_percent
     (picture,) = pictures.iterdir()
     assert cv2.imread(str(picture)).shape == (480, 1288, 3)
 

@@ -10,6 +10,17 @@ from hypothesis import settings
 settings.register_profile("steady", deadline=None, derandomize=True)
 settings.load_profile("steady")
 
+# Made once for many tests, but not in a moment: scenes that are rendered, a cluster, several training processes.
+SLOW_FIXTURES = {"cluster", "demo", "scene", "several"}
+
+
+@pytest.hookimpl(tryfirst=True)  # before those that are not wanted are left out
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what needs such a fixture as slow, beside the tests that are marked themselves."""
+    for item in items:
+        if SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.slow)
+
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:

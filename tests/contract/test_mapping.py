@@ -259,6 +259,7 @@ def inputs_of_mapper(monkeypatch) -> list[Path | str]:
     return calls
 
 
+@pytest.mark.slow
 def test_a_killed_mapping_goes_on_from_its_newest_snapshot(tmp_path, inputs_of_mapper):
     oracle = make_oracle(tmp_path, num_images=12, num_points=100, seed=5)
     folder = tmp_path / "out"

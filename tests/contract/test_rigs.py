@@ -139,6 +139,7 @@ def test_the_mapper_keeps_to_the_poses_of_the_rig(tmp_path, oracle, mapper, capf
     assert len(errors) == 10 and max(error.proj_center_error for error in errors) < 1e-2
 
 
+@pytest.mark.slow
 def test_poses_that_the_rig_lacks_are_found(tmp_path, oracle):
     rig = write_rig(tmp_path, [{"cameras": [RIG[0]["cameras"][0], {"image_prefix": "right/"}]}])
     cameras = make_cameras(oracle.images, CameraConfig(params=PARAMS, rig=rig))

@@ -79,6 +79,7 @@ def test_text_files_named_like_photos(tmp_path, run):
     assert_refused(finished, photos, "2 images but none can be used", photos / "a.jpg")
 
 
+@pytest.mark.slow
 def test_a_truncated_photo_among_good_ones(scene, tmp_path, run, caplog):
     photos = copy_photos(scene, tmp_path / "photos")
     data = (photos / "view_02.jpg").read_bytes()
@@ -90,6 +91,7 @@ def test_a_truncated_photo_among_good_ones(scene, tmp_path, run, caplog):
     assert (summary["num_images"], summary["skipped_images"], summary["registered"]) == (4, 1, 4)
 
 
+@pytest.mark.slow
 def test_photos_of_16_bits_grey_rgba_and_cmyk(scene, tmp_path, run):
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -120,6 +122,7 @@ def test_a_tiny_photo_is_skipped(scene, tmp_path, run, caplog):
     assert caplog.messages == [f"skipped: {photos / 'tiny.png'} is 20 x 20 px, at least 32 px a side are needed"]
 
 
+@pytest.mark.slow
 def test_a_huge_photo_is_listed_and_reduced(tmp_path):
     cells = np.random.default_rng(0).integers(0, 255, (90, 120), np.uint8)
     huge = np.kron(cells, np.ones((100, 100), np.uint8))
@@ -132,6 +135,7 @@ def test_a_huge_photo_is_listed_and_reduced(tmp_path):
     np.testing.assert_allclose(prepared.stored_from_scaled[:2, :2], np.diag([12000 / 1024, 9000 / 768]))
 
 
+@pytest.mark.slow
 def test_two_identical_photos_make_no_model(scene, tmp_path, run):
     photos = copy_photos(scene, tmp_path / "photos", count=1)
     shutil.copy(photos / "view_00.jpg", photos / "view_01.jpg")
@@ -139,6 +143,7 @@ def test_two_identical_photos_make_no_model(scene, tmp_path, run):
     assert_refused(finished, "no model could be built from 2 images", tmp_path / "out", code=3)
 
 
+@pytest.mark.slow
 def test_photos_with_nothing_in_common_keep_database_and_matches(tmp_path, run, read_matches):
     photos = write_unrelated_photos(tmp_path / "photos")
     out = tmp_path / "out"

@@ -1,6 +1,6 @@
 """Matching by the workers of a local Ray cluster: the same matches, also where a worker is lost.
 
-A worker computes with one thread, and so does the process that it is compared with: test_threads.py has what more change.
+A worker computes with one thread, and so does the process that it is compared with: see test_threads.py for more.
 """
 
 import sys

@@ -103,6 +103,7 @@ def test_match_stops_after_the_matches(scene, tmp_path, run, read_matches):
     assert all(len(fields["score"]) > 100 for fields in matches.values())
 
 
+@pytest.mark.slow
 def test_match_pairs_by_their_looks(scene, tmp_path, run, read_matches, matched_pairs):
     command = ("match", scene.images, tmp_path / "out", "--pairs", "retrieval", "--set", "pairs.retrieval_top=1")
     finished = run(*command)
@@ -115,6 +116,7 @@ def test_match_pairs_by_their_looks(scene, tmp_path, run, read_matches, matched_
     assert len(matched_pairs) == len(pairs)
 
 
+@pytest.mark.slow
 def test_quiet_prints_no_progress_and_no_warnings(scene, tmp_path, spawn):
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -168,6 +170,7 @@ def test_settings_come_from_the_file_then_set_then_options(scene, out, tmp_path,
     assert [camera.model for camera in cameras] == [pycolmap.CameraModelId.OPENCV] * 5
 
 
+@pytest.mark.slow
 def test_evaluate_scores_the_poses_of_a_scene(scene, tmp_path, run):
     shutil.copytree(scene.images, tmp_path / "images")
     write_strecha_cameras(tmp_path / "gt_dense_cameras", scene.views)
@@ -187,6 +190,7 @@ def test_evaluate_refuses_a_folder_without_truth(scene, run):
         assert finished.err.startswith("hm-sfm: ") and str(scene.images) in finished.err
 
 
+@pytest.mark.slow
 def test_train_makes_weights_that_match_uses(scene, tmp_path, run, read_matches):
     torch.manual_seed(0)
     torch.save(XFeatTrunk().state_dict(), tmp_path / "xfeat.pt")

@@ -15,6 +15,8 @@ import pytest
 import hm_sfm.io.batches
 from hm_sfm.cli import main
 
+pytestmark = pytest.mark.slow
+
 KILLS = int(os.environ.get("KILLS", "5"))
 """How often to kill; `KILLS=20 pytest tests/e2e/test_interruptions.py` for more."""
 

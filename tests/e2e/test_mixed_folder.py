@@ -16,6 +16,8 @@ from hm_sfm.synthetic.demo import COLMAP_DIAGONAL_35MM, make_demo_scene, make_de
 from hm_sfm.synthetic.rendering import render_view
 from hm_sfm.types import PinholeView
 
+pytestmark = pytest.mark.slow
+
 LENSES = {"camera": ((384, 256), 35), "phone": ((320, 240), 28)}
 """Folder -> stored size, 35 mm equivalent focal length."""
 ORIENTATIONS = {"camera": (1, 8, 1), "phone": (1, 6, 8)}

@@ -28,6 +28,7 @@ def test_show_draws_matches_and_the_warped_photo(scene, tmp_path, run):
     assert error < 0.6 * unwarped
 
 
+@pytest.mark.slow
 def test_a_photo_on_its_side_and_one_of_the_same_name(scene, tmp_path, run):
     a = scene.images / "view_00.jpg"
     photo = cv2.cvtColor(cv2.imread(str(scene.images / "view_01.jpg")), cv2.COLOR_BGR2RGB)

@@ -107,6 +107,7 @@ def test_linear_attention_equals_the_quadratic_form():
     assert torch.allclose(attend_linearly(query, key, value), naive, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_loftr_checkpoint_matches_images(checkpoint):
     net = load_weights(str(checkpoint), LOFTR)
     matcher = HomoMatcher.from_network(net, MatchingConfig(coarse_threshold=0.0), ImageConfig(long_edge_px=128))
@@ -129,6 +130,7 @@ def test_a_checkpoint_that_lacks_keys_is_refused(kornia_net, tmp_path):
         load_weights(str(tmp_path / "short.ckpt"), LOFTR)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["loftr", "loftr_homo", "loftr_homo_heavy"])
 @torch.inference_mode()
 def test_the_papers_networks_run(name):

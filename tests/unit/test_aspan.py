@@ -273,6 +273,7 @@ def test_gradients_reach_all_parameters(coarse, generator):
     assert all(p.grad.isfinite().all() for p in coarse.parameters())
 
 
+@pytest.mark.slow
 def test_the_flow_of_a_shifted_map_is_learnt(coarse, generator):
     maps, truth = make_shifted(generator, (4, -2))
     cells = as_cells(coarse.describe(maps))
@@ -336,6 +337,7 @@ def test_a_flow_is_never_surer_than_the_truth_can_be(coarse):
 # In the network
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "window", "radius"), [("aspan_homo", 9, 1), ("aspan_homo_heavy", 17, 3)])
 def test_the_papers_networks_run(name, window, radius):
     config = load_config(Path(f"configs/{name}.yaml"))

@@ -120,6 +120,7 @@ def test_half_precision_stays_inside(maps, trained):
     torch.testing.assert_close(corrected[0], exact[0], atol=0.05, rtol=0)
 
 
+@pytest.mark.slow
 def test_it_learns_which_of_two_equal_windows_is_meant(generator, one_thread):
     """Both halves of the view look alike: plain features cannot tell them apart, positions and context can."""
     half = torch.randn(1, 64, 4, 4, generator=generator)

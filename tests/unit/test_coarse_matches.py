@@ -270,6 +270,7 @@ def write_loftr(path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write", [write_attention, write_loftr])
 def test_other_weights_find_what_they_find_themselves(photos, tmp_path, monkeypatch, write):
     monkeypatch.setattr(weights, "LEAST_CONFIDENCE", 1e-9)

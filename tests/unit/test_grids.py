@@ -212,6 +212,7 @@ def test_a_smaller_image_shows_no_offset_either(matcher, waves, image):
     assert abs((there - back).mean() / (1 / scale - scale)) < OFFSET_LIMIT_PX
 
 
+@pytest.mark.slow
 def test_a_photo_twice_as_large_as_the_matching_resolution(matcher, waves, image):
     """Both photos look the same to the network: what differs is the way back to stored pixels."""
     half = np.diag([0.5, 0.5, 1.0])

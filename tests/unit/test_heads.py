@@ -102,6 +102,7 @@ def test_unknown_parts_are_refused(field):
         HomoNet(NetworkConfig(**{field: "heavy"}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spacing", [1, 2])
 def test_homography_head_learns_a_small_warp(spacing):
     """The features are exact functions of position, so what is left to learn is to read the correlations."""

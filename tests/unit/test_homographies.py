@@ -13,6 +13,7 @@ def matcher():
     return HomoMatcher.from_pretrained("light")
 
 
+@pytest.mark.slow
 def test_homographies_of_a_small_hpatches_folder(tmp_path, matcher):
     image = make_texture(np.random.default_rng(0), "bricks", (2.4, 1.8), 160)
     sequence = tmp_path / "v_bricks"

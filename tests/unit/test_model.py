@@ -408,6 +408,7 @@ def test_the_scale_of_a_score_gives_the_score():
         assert score_from_scale(np.array([scale_from_score(score, grid)]), grid)[0] == pytest.approx(score)
 
 
+@pytest.mark.slow
 def test_pairs_with_few_good_matches_grow_more():
     """A turn of 30 degrees, which the coarse features bear in places only."""
     image = make_texture(320, 256)

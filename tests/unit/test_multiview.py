@@ -124,6 +124,7 @@ def test_pairs_are_photos_that_share_points(tmp_path):
     np.testing.assert_allclose(pair.xy1, pair.xy0 @ MIRROR[:, :2].T + MIRROR[:, 2], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_validation_scenes_are_taken_only_by_their_names(tmp_path):
     held_out = VALIDATION_SCENES[3]
     for name in ("house", "bridge", held_out):
@@ -251,6 +252,7 @@ def test_items_depend_on_seed_and_index_alone(scenes):
         assert not np.array_equal(first[7][key], other[7][key], equal_nan=key == "points")
 
 
+@pytest.mark.slow
 def test_scenes_come_equally_often(tmp_path, monkeypatch):
     """Whatever their number of pairs."""
     write_scene(tmp_path, "house")

@@ -101,6 +101,7 @@ def test_points_of_real_photos_are_not_shifted_either():
     assert (apart[1] == 4).float().mean() > 0.3
 
 
+@pytest.mark.slow
 def test_the_training_is_supervised_as_its_configuration_says(training):
     losses = {}
     for supervise in ("centre", "dense", "suppressed"):

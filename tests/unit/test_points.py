@@ -171,6 +171,7 @@ def test_unknown_validation_pairs_are_refused(kind, count, text):
 # The command
 
 
+@pytest.mark.slow
 # A warp of the one held-out photo shows it four times, and nothing tells which of them is the right one.
 @pytest.mark.parametrize(("kind", "least_percent"), [("rendered", 70), ("warped", 20)])
 def test_evaluate_points_prints_writes_and_draws(tmp_path, capsys, kind, least_percent):

@@ -169,6 +169,7 @@ def test_photos_of_the_matching_resolution_keep_their_scale(photos, matcher, tmp
     assert np.isnan(after[before > 1.2]).all()
 
 
+@pytest.mark.slow
 def test_what_was_done_is_not_done_again_and_other_edges_are(photos, matcher, tmp_path, monkeypatch):
     graph = connect_photos(photos)
     first = refine(graph, photos, matcher, tmp_path)
@@ -205,6 +206,7 @@ def test_photos_are_shown_upright_and_in_one_scale(rotation_deg, scale):
     assert (hypothesis0.downscale, hypothesis1.downscale) == {0.3: (4, 1), 0.9: (1, 1), 1.2: (1, 1), 2.2: (1, 2)}[scale]
 
 
+@pytest.mark.slow
 def test_a_photo_on_its_side_and_twice_as_large_gets_more_exact_too(photos, matcher, tmp_path):
     large = cv2.resize(cv2.imread(str(photos[1].path)), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
     cv2.imwrite(str(tmp_path / "b.png"), cv2.rotate(large, cv2.ROTATE_90_CLOCKWISE))

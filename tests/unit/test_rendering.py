@@ -184,6 +184,7 @@ def test_demo_views_look_at_the_scene_from_an_arc(count):
         assert depth > 0 and (np.abs(xy_px - [320, 240]) < 80).all()
 
 
+@pytest.mark.slow
 def test_demo_scene_is_the_same_place_from_two_views():
     quads = make_demo_scene(0)
     views = make_demo_views(12, (320, 240))[4:6]

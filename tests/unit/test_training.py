@@ -241,6 +241,7 @@ def interrupt_after(monkeypatch, step: int) -> None:
     monkeypatch.setattr(loop, "train_step", stop)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stage", "saved"),
     [
@@ -285,6 +286,7 @@ TRAINED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", loop.STAGES)
 def test_a_stage_changes_all_of_its_own_parts_and_nothing_else(training, stage):
     """Of the others, not even the running statistics of batch norms."""
@@ -358,6 +360,7 @@ def test_megadepth_is_one_of_the_kinds_of_pairs(training, monkeypatch):
     assert 15 < sum("tag" in pairs[i] for i in range(40)) < 40
 
 
+@pytest.mark.slow
 def test_a_loss_that_is_not_finite_stops_and_keeps_the_checkpoint(training, monkeypatch):
     def measure(*arguments):
         parts = measure_objective(*arguments)
@@ -389,6 +392,7 @@ def test_a_gradient_that_is_not_finite_changes_no_weights(training):
     assert all(torch.equal(value, before[name]) for name, value in state.net.state_dict().items())
 
 
+@pytest.mark.slow
 def test_the_coarse_stage_learns_a_pair_by_heart(training):
     """From plain features of random convolutions, which say little."""
     training = dataclasses.replace(training, stage="coarse", learning_rate=3e-3, steps=90, warmup_steps=5)
@@ -454,6 +458,7 @@ def test_unusable_xfeat_files_are_refused(training, tmp_path):
     assert not Path(training.out).exists()
 
 
+@pytest.mark.slow
 def test_a_stage_goes_on_from_the_weights_of_another(training, tmp_path, caplog):
     """Their parts are taken over; a coarse stage that they lack starts new, and says so."""
     plain = dataclasses.replace(training.network, coarse="cosine")
@@ -507,6 +512,7 @@ def test_a_photo_that_is_damaged_later_is_named_in_one_line(training, tmp_path):
     assert re.fullmatch(r".*house/[ab]\.png cannot be read as an image", str(error.value))
 
 
+@pytest.mark.slow
 def test_a_training_draws_its_curves(training, monkeypatch):
     monkeypatch.setattr(loop, "draw_curves", draw_curves)
     path = train(dataclasses.replace(training, steps=1), quiet=True)

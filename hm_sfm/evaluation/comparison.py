@@ -34,12 +34,13 @@ from hm_sfm.formats.strecha import read_strecha_cameras
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.io.locks import release_locks
 from hm_sfm.keypoints.tracks import build_tracks, label_tracks
+from hm_sfm.matching.masked_store import MaskedStore
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.providers.choice import check_coarse
 from hm_sfm.matching.run import match_pairs
 from hm_sfm.matching.store import MatchStore, digest_image
 from hm_sfm.photos.images import list_images
-from hm_sfm.photos.masks import NO_MASKS, MaskedStore, Masks, read_masks
+from hm_sfm.photos.masks import NO_MASKS, Masks, read_masks
 from hm_sfm.pipeline.reconstruction import (
     choose_pairs,
     claim_folder,

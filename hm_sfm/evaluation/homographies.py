@@ -13,10 +13,10 @@ from tqdm import tqdm
 from hm_sfm.errors import InputError
 from hm_sfm.evaluation.poses import pose_auc
 from hm_sfm.geometry.frames import homography_from_pixel_index
-from hm_sfm.matching.interfaces import ImageFeatures
+from hm_sfm.matching.feature_cache import FeatureCache
 from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.photos.images import prepare_image, read_ref
-from hm_sfm.types import PatchMatches
+from hm_sfm.photos.images import PreparedImage, prepare_image, read_ref
+from hm_sfm.types import ImageRef, PatchMatches
 
 CORNER_THRESHOLDS_PX = (3, 5, 10)
 HOMOGRAPHY_ERROR_PX = 3.0
@@ -40,18 +40,16 @@ def score_homographies(
     if not sequences:
         raise InputError(f"{folder} is no folder in HPatches' layout: no */H_1_2 there")
     errors, counts = [], []
+    cache = FeatureCache(matcher, _prepare_short_edge)
     for sequence in tqdm(sequences, desc="homographies", unit="sequence", disable=quiet):
-        path0 = _find_image(sequence, 1)
-        features0, size_wh, _ = _encode_short_edge(matcher, path0)
-        for number in range(2, 7):
-            path1 = _find_image(sequence, number)
-            features1, _, px_scale1 = _encode_short_edge(matcher, path1)
-            matches = matcher.match_features(features0, features1)
+        ref0, *others = (read_ref(_find_image(sequence, number)) for number in range(1, 7))
+        for number, ref1 in enumerate(others, start=2):
+            matches = cache.match(ref0.path, ref1.path)
             true = homography_from_pixel_index(np.loadtxt(sequence / f"H_1_{number}"))
             if observe is not None:
-                observe(path0, path1, true, matches)
+                observe(ref0.path, ref1.path, true, matches)
             counts.append(len(matches))
-            errors.append(_measure_corner_error(matches, true, size_wh, px_scale1))
+            errors.append(_measure_corner_error(matches, true, ref0.size_wh, _measure_scale(ref1)))
     scores = {f"auc_{limit}px": area for limit, area in pose_auc(np.array(errors), CORNER_THRESHOLDS_PX).items()}
     return scores | {"mean_matches": float(np.mean(counts))}
 
@@ -63,12 +61,14 @@ def _find_image(sequence: Path, number: int) -> Path:
     return path
 
 
-def _encode_short_edge(matcher: HomoMatcher, path: Path) -> tuple[ImageFeatures, tuple[int, int], float]:
-    """Features, stored size (w, h) px and stored px per reduced px of an image."""
+def _prepare_short_edge(path: Path) -> PreparedImage:
     ref = read_ref(path)
-    px_scale = max(1.0, min(ref.size_wh) / HPATCHES_SHORT_EDGE_PX)
-    features = matcher.encode(prepare_image(ref, round(max(ref.size_wh) / px_scale)))
-    return features, ref.size_wh, px_scale
+    return prepare_image(ref, round(max(ref.size_wh) / _measure_scale(ref)))
+
+
+def _measure_scale(ref: ImageRef) -> float:
+    """Px of the stored image per px of the reduced one."""
+    return max(1.0, min(ref.size_wh) / HPATCHES_SHORT_EDGE_PX)
 
 
 def _measure_corner_error(matches: PatchMatches, true: np.ndarray, size_wh: tuple[int, int], px_scale1: float) -> float:

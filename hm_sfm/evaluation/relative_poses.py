@@ -16,8 +16,9 @@ from tqdm import tqdm
 from hm_sfm.errors import InputError
 from hm_sfm.evaluation.poses import measure_angle_deg, measure_rotation_deg, pose_auc, relative_pose
 from hm_sfm.formats.strecha import read_strecha_cameras
+from hm_sfm.matching.feature_cache import FeatureCache
 from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.photos.images import prepare_image, read_ref
+from hm_sfm.photos.images import PreparedImage, prepare_image, read_ref
 from hm_sfm.types import PatchMatches, freeze_array
 
 POSE_THRESHOLDS_DEG = (5, 10, 20)
@@ -113,16 +114,12 @@ def score_poses(
     quiet: bool = False,
     observe: Callable[[PosePair, PatchMatches], None] | None = None,
 ) -> dict[str, float]:
-    """score_pose_matches of a HomoMatcher's matches; each photo is encoded once."""
-    features = {}
+    """score_pose_matches of the matches that a reconstruction would use."""
 
-    def match(path0: Path, path1: Path) -> PatchMatches:
-        for path in (path0, path1):
-            if path not in features:
-                features[path] = matcher.encode(prepare_image(read_ref(path), matcher.images.long_edge_px))
-        return matcher.match_features(features[path0], features[path1])
+    def prepare(path: Path) -> PreparedImage:
+        return prepare_image(read_ref(path), matcher.images.long_edge_px)
 
-    return score_pose_matches(match, pairs, quiet, observe)
+    return score_pose_matches(FeatureCache(matcher, prepare).match, pairs, quiet, observe)
 
 
 def score_pose_matches(

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from hm_sfm.config import ImageConfig, MatchingConfig
@@ -100,6 +101,7 @@ class PairMatcher(Protocol):
 
     config: MatchingConfig
     images: ImageConfig
+    device: torch.device
     cell_matcher: CellMatcher | None
     """Compares rotation and scale hypotheses; None where pairs are matched as they are only."""
 
@@ -110,3 +112,11 @@ class PairMatcher(Protocol):
     def match_features(self, features0: Any, features1: Any) -> PatchMatches:
         """Match two images; coordinates are px of the stored images."""
         ...
+
+
+@dataclass(frozen=True)
+class MatchingTimes:
+    """Seconds spent on reading and encoding photos, and on matching pairs."""
+
+    features: float
+    match: float

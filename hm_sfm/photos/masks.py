@@ -16,8 +16,7 @@ import pycolmap
 
 from hm_sfm.config import MaskConfig
 from hm_sfm.errors import InputError
-from hm_sfm.matching.store import MatchStore
-from hm_sfm.types import ImagePair, ImageRef, PairMatches
+from hm_sfm.types import ImageRef, PairMatches
 
 logger = logging.getLogger(__name__)
 
@@ -56,18 +55,6 @@ class Masks:
 
 
 NO_MASKS = Masks()
-
-
-@dataclass(frozen=True)
-class MaskedStore:
-    """Stored matches as they are read with masks: those in masked pixels are left out."""
-
-    store: MatchStore
-    masks: Masks
-
-    def read(self, pair: ImagePair) -> PairMatches:
-        """The matches of one pair. Raises KeyError where they were never stored."""
-        return self.masks.drop_hidden(self.store.read(pair))
 
 
 def read_masks(images: Sequence[ImageRef], config: MaskConfig) -> Masks:

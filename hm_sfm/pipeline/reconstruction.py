@@ -32,6 +32,7 @@ from hm_sfm.keypoints.graph import Photo
 from hm_sfm.keypoints.persistence import persist_keypoints
 from hm_sfm.keypoints.refinement import KeypointRefiner
 from hm_sfm.keypoints.seeds import find_seeds
+from hm_sfm.matching.masked_store import MaskedStore
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.providers.choice import check_coarse, describe_coarse
 from hm_sfm.matching.run import check_engine, match_pairs
@@ -41,7 +42,7 @@ from hm_sfm.network.checkpoints import digest_weights
 from hm_sfm.pairs.retrieval import CellStore, describe_images, find_similar
 from hm_sfm.pairs.selection import select_pairs
 from hm_sfm.photos.images import list_images, prepare_image
-from hm_sfm.photos.masks import NO_MASKS, MaskedStore, Masks, read_masks
+from hm_sfm.photos.masks import NO_MASKS, Masks, read_masks
 from hm_sfm.report.diagnosis import Diagnosis, diagnose
 from hm_sfm.report.gather import gather_report
 from hm_sfm.report.page import write_report

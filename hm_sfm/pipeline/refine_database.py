@@ -23,11 +23,12 @@ from hm_sfm.geometry.frames import pixel_index_from_px
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.io.locks import release_locks
+from hm_sfm.matching.masked_store import MaskedStore
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.providers.choice import check_coarse
 from hm_sfm.matching.run import match_pairs
 from hm_sfm.photos.images import read_ref
-from hm_sfm.photos.masks import MaskedStore, read_masks
+from hm_sfm.photos.masks import read_masks
 from hm_sfm.pipeline.reconstruction import Matched, claim_folder, open_store, verify_and_propagate, write_verified
 from hm_sfm.types import ImagePair, ImageRef
 

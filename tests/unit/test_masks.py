@@ -10,7 +10,8 @@ from hm_sfm.config import KeypointConfig, MaskConfig
 from hm_sfm.errors import InputError
 from hm_sfm.keypoints.graph import Photo
 from hm_sfm.keypoints.persistence import persist_keypoints
-from hm_sfm.photos.masks import MaskedStore, Masks, read_masks
+from hm_sfm.matching.masked_store import MaskedStore
+from hm_sfm.photos.masks import Masks, read_masks
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
 NAMES = ("a/b.jpg", "a/b.png", "c.jpg")

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import hm_sfm.matching.run as matching
+from hm_sfm.matching import feature_cache
 from hm_sfm.matching.order import count_loads, order_pairs
 from hm_sfm.matching.run import match_pairs
 from hm_sfm.types import ImagePair, ImageRef, PatchMatches
@@ -122,7 +122,7 @@ class CountingMatcher:
 
 @pytest.mark.parametrize("capacity", [2, 5, 100])
 def test_matching_loads_as_planned_and_the_order_changes_no_match(capacity, monkeypatch, tmp_path):
-    monkeypatch.setattr(matching, "prepare_image", lambda image, long_edge_px: image.name)
+    monkeypatch.setattr(feature_cache, "prepare_image", lambda image, long_edge_px: image.name)
     pairs = make_pairs(itertools.combinations(range(20), 2))
     images = [
         ImageRef(name, tmp_path / name, (64, 64)) for name in sorted({pair.name0 for pair in pairs} | {"0019.jpg"})

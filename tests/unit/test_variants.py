@@ -7,10 +7,10 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from tqdm import tqdm
 
 from hm_sfm.config import ImageConfig, MatchingConfig
 from hm_sfm.geometry.frames import pixel_index_from_px, rotation_matrix
+from hm_sfm.matching.feature_cache import cache_features, match_pair
 from hm_sfm.matching.hypotheses import (
     FEW_MATCHES,
     ROTATIONS,
@@ -24,7 +24,6 @@ from hm_sfm.matching.hypotheses import (
     relate_scales,
 )
 from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.matching.run import FeatureCache
 from hm_sfm.photos.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
 from hm_sfm.photos.images import CV_ROTATIONS, prepare_array, prepare_image, read_ref, read_rgb
 from hm_sfm.synthetic.textures import MATERIALS, make_texture
@@ -157,8 +156,9 @@ def test_neither_order_nor_memory_matter(matcher, folder, one_thread):
     pairs = [ImagePair(f"{a}.png", f"{b}.png") for a, b in ("ab", "bc", "ac")]
     found = []
     for order, limit_mb in ((pairs, 1500), (pairs[::-1], 3)):
-        cache = FeatureCache(images, matcher, limit_mb, tqdm(disable=True))
-        found.append({pair: cache.match(pair) for pair in order})
+        limited = HomoMatcher.from_network(matcher.net, MatchingConfig(feature_cache_mb=limit_mb), ImageConfig())
+        cache = cache_features(images, limited)
+        found.append({pair: match_pair(cache, pair) for pair in order})
         held = sum(made.size_bytes for made in cache.cached.values())
         assert held <= limit_mb * 1_000_000
     for pair in pairs:

@@ -1,6 +1,6 @@
 """The configuration: YAML into nested frozen dataclasses, and fingerprints of what made a result.
 
-The defaults stand here and only here; `configs/light.yaml` spells them out and a test keeps the two equal.
+The defaults are defined here and nowhere else. `configs/light.yaml` spells them out; a test keeps the two equal.
 """
 
 import dataclasses
@@ -32,13 +32,13 @@ class NetworkConfig:
     window: int = 9
     """w: side of a fine patch, cells of the 1/2 grid."""
     radius: int = 1
-    """r: radius of the correlation window that is sampled at each iteration."""
+    """r: radius of the correlation window sampled in each iteration."""
     iterations: int = 2
-    """K: homography updates (the paper: 3, and weights are trained with as many; any number can be made of them)."""
+    """K: homography updates. The paper and training use 3; trained weights work with any number."""
     margin: int = 2
-    """Cells by which the patch searched in image 1 is larger on each side (the paper: 0)."""
+    """Cells by which the patch searched in image 1 is larger than that of image 0, on each side (the paper: 0)."""
     spacing: int = 2
-    """Cells from one point of image 0's patch that is looked up in image 1 to the next (the paper: 1)."""
+    """Cells between the points of image 0's patch that are looked up in image 1, in each direction (the paper: 1)."""
 
     def __post_init__(self) -> None:
         check_words(self, "network")
@@ -47,17 +47,17 @@ class NetworkConfig:
 @dataclass(frozen=True)
 class ImageConfig:
     long_edge_px: int = 1024
-    """Photos are reduced to this size for matching (never enlarged); keypoints are in original pixels."""
+    """The matching resolution: photos are reduced to this, never enlarged. Keypoints are px of the stored photo."""
 
 
 @dataclass(frozen=True)
 class MaskConfig:
-    """Black pixels of masks are not matched."""
+    """Photos are not matched where their masks are black."""
 
     folder: str = ""
-    """Holds the mask of a/b.jpg as a/b.jpg.png, of the same size."""
+    """Folder of masks: that of a/b.jpg is a/b.jpg.png and has the same size."""
     camera: str = ""
-    """A mask of all images of its size."""
+    """A mask for all photos of its size."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +65,17 @@ class PairConfig:
     mode: str = "auto"
     """auto | exhaustive | sequential | retrieval | spatial | a pairs file."""
     exhaustive_limit: int = 60
-    """auto matches all pairs up to this many images; of more, those of retrieval, spatial and a sequence's window."""
+    """auto: all pairs of up to this many images; for more, the pairs of retrieval, spatial and a sequence's window."""
     window: int = 5
-    """sequential: each image with so many followers, and with those at distances of powers of two."""
+    """sequential: pair each image with this many followers, and with those at distances of powers of two."""
     loop_top: int = 0
-    """sequential: and with so many that look most like it far from it in the sequence."""
+    """sequential: also pair it with this many of the most similar images far from it in the sequence."""
     retrieval_top: int = 20
-    """retrieval: each image with so many that look most like it."""
+    """retrieval: pair each image with this many of the most similar ones."""
     spatial_top: int = 20
-    """spatial: each image with so many that were taken nearest to it, by the positions in EXIF,"""
+    """spatial: pair each image with this many of the nearest ones, by the GPS positions in EXIF ..."""
     spatial_distance_m: float = 100.0
-    """and none farther away than this."""
+    """... but with none farther away than this."""
 
 
 @dataclass(frozen=True)
@@ -83,24 +83,25 @@ class MatchingConfig:
     model: str = "light"
     """Name of bundled weights, or a file."""
     coarse: str = "light"
-    """What makes the coarse matches that homographies are estimated for: light (the network itself) | sift | lightglue |
-    xfeat | a file of weights, LoFTR's or made by hm-sfm train, whose coarse stage is used."""
+    """Where the coarse matches come from, for which homographies are estimated: light (the network itself) | sift |
+    lightglue | xfeat | a file of weights, LoFTR's or made by hm-sfm train, whose coarse stage is used."""
     coarse_matches: str = ""
-    """A file with the matches of any matcher instead, as hloc or its match_dense write them;"""
+    """A file with coarse matches of any other matcher instead, in the format of hloc or of its match_dense."""
     coarse_features: str = ""
-    """and with the keypoints that these are of, where they are indices."""
+    """A file with the keypoints, in hloc's format, if coarse_matches holds indices of keypoints."""
     coarse_threshold: float = 0.8
     """light: least cosine similarity of a coarse match."""
     max_matches: int = 8000
-    """Best-scored matches kept per pair."""
+    """The matches with the best scores that are kept per pair."""
     grow_below: int = 300
-    """In pairs with fewer good matches, these spread to neighbours that the coarse stage missed; 0 is the paper. Where
-    there are enough, grown matches are no gain: they are less exact than those that the coarse stage finds itself."""
+    """In pairs with fewer good matches than this, these grow to neighbours that the coarse stage missed; 0, as in the
+    paper, grows none. Pairs with enough gain nothing, because grown matches are less exact than those of the coarse
+    stage."""
     try_hypotheses: bool = True
-    """Pairs with few good matches are looked at turned by quarters and reduced to 1/2 and 1/3, and matched again where
-    that fits clearly better."""
+    """Pairs with few good matches are tried with one photo rotated by quarter turns and reduced to 1/2 and 1/3, and are
+    matched again where that fits clearly better."""
     feature_cache_mb: int = 1500
-    """Per process that matches: two photos at least."""
+    """Memory for the features of photos in each process that matches. It must hold two photos."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto takes the GPU if there is one."""
     engine: Literal["serial", "ray"] = "serial"
@@ -112,40 +113,42 @@ class MatchingConfig:
 
 @dataclass(frozen=True)
 class VerificationConfig:
-    """Two-view geometry, before anything is carried and again on the final keypoints."""
+    """Two-view geometry, before keypoints are propagated and again with the final keypoints."""
 
     min_score: float = 0.5
-    """Matches below are not used: they are off by more than a pixel, or wrong altogether."""
+    """Matches with a lower score are not used: they are probably off by more than 1 px of the matching resolution."""
     max_error_px: float = 3.0
-    """At the matching resolution; scaled to the photo."""
+    """Largest error of an inlier, px of the matching resolution; it is scaled to the photo."""
     min_inliers: int = 30
     min_inlier_ratio: float = 0.25
     doubtful_inlier_ratio: float = 0.6
-    """What a pair with no more than min_inliers needs instead; it falls to min_inlier_ratio at sure_inliers. Chance
-    finds an epipolar line for a third of the matches of two different places."""
+    """The ratio that a pair with only min_inliers needs. With more inliers, the ratio needed falls, to min_inlier_ratio
+    at sure_inliers. By chance, a third of the matches of two different places agree with an epipolar geometry."""
     sure_inliers: int = 300
 
 
 @dataclass(frozen=True)
 class KeypointConfig:
-    """Persistence. Distances in px of the matching resolution, scaled to each photo."""
+    """Persistent keypoints. Distances are px of the matching resolution; they are scaled to each photo."""
 
     propagation_min_score: float = 0.7
-    """Patches with a lower score carry no points, but for the best ones of pairs that have few. hm-sfm refine does
-    without it: it begins with matches that were verified."""
+    """Patches with a lower score propagate no keypoints, except for the best patches of pairs that have few. hm-sfm
+    refine ignores this setting, because it starts from verified matches."""
     propagation_radius_px: float = 8.0
-    """A patch carries points no farther than this from its centre."""
+    """A patch propagates keypoints up to this distance from its centre."""
     join_radius_px: float = 1.0
+    """A propagated keypoint joins an existing one up to this distance from it ..."""
     separation_px: float = 2.0
+    """... and becomes a new one only if all others are farther away than this."""
     seed_spacing_px: float = 3.0
-    """A patch seeds a keypoint where none is nearer than this."""
+    """A patch seeds a keypoint if there is none up to this distance."""
     adjustment_rounds: int = 15
-    """Of the joint adjustment of each track's keypoints; 0 leaves them where they were first predicted."""
+    """Rounds of the joint adjustment of each track's keypoints; 0 leaves them where they were first predicted."""
     max_keypoints: int = 8000
-    """Per image, longest tracks first, spread over the image."""
+    """Keypoints kept per image: the longest tracks first, spread over the image."""
     refine_long_edge_px: int = 1024
-    """Long edge of the photos on which a second fine pass places carried keypoints again, at least images.long_edge_px,
-    never enlarged; 0 leaves it out. Networks without homographies do without it."""
+    """Long edge of the photos used for keypoint refinement. Photos are never enlarged, and at least images.long_edge_px
+    is used. 0 turns refinement off; networks without a homography head have none."""
 
 
 @dataclass(frozen=True)
@@ -154,13 +157,13 @@ class CameraConfig:
     """Which photos share a camera; auto goes by size and EXIF."""
     model: str = "SIMPLE_RADIAL"
     params: str = ""
-    """Known intrinsics, `f,...` in the order of COLMAP's camera model; they stay fixed."""
+    """Known intrinsics, `f,...` in the order of the camera model's parameters; they stay fixed."""
     file: str = ""
     """A COLMAP model, or its cameras.txt or cameras.bin, with the known intrinsics of each image; they stay fixed."""
     poses: str = ""
-    """As `file`, and the poses are known, too: points are triangulated, nothing is mapped."""
+    """A COLMAP model with known intrinsics and poses; both stay fixed, and only points are triangulated."""
     rig: str = ""
-    """A rig configuration as COLMAP has it: which photos were taken together by cameras that are mounted together."""
+    """A rig configuration in COLMAP's format, for cameras that are mounted together."""
 
     def __post_init__(self) -> None:
         check_words(self, "cameras")
@@ -169,9 +172,11 @@ class CameraConfig:
 @dataclass(frozen=True)
 class MappingConfig:
     mapper: Literal["incremental", "global"] = "incremental"
-    """COLMAP's incremental mapper, image by image, or its global one, all at once."""
+    """COLMAP's incremental mapper adds one image after another, its global mapper takes all at once."""
     min_model_size: int = 2
+    """Fewest images of a model."""
     seed: int = 0
+    """Seed of the random numbers in mapping."""
 
     def __post_init__(self) -> None:
         check_words(self, "mapping")
@@ -272,7 +277,7 @@ def check_word(value: Any, allowed: tuple[str, ...], name: str) -> None:
 
 
 def read_yaml(path: Path) -> Any:
-    """The YAML tree of a file. Raises ConfigError where it cannot be read or parsed."""
+    """The YAML tree of a file. Raises ConfigError if it cannot be read or parsed."""
     try:
         return yaml.safe_load(Path(path).read_text())
     except OSError as error:

@@ -1,14 +1,14 @@
-"""What can go wrong, as the user sees it: one clear sentence and an exit code."""
+"""Everything that can be expected to go wrong, as users see it: one clear sentence and an exit code."""
 
 
 class HmSfmError(Exception):
-    """Base of all expected failures. Its text is one sentence that names the file or option at fault."""
+    """Base of all expected failures. The text is one sentence that names the file or option at fault."""
 
     exit_code = 2
 
 
 class InputError(HmSfmError):
-    """A file, folder or argument that the user gave is unusable."""
+    """A file, folder or argument given by the user cannot be used."""
 
 
 class ConfigError(HmSfmError):
@@ -16,11 +16,11 @@ class ConfigError(HmSfmError):
 
 
 class WeightsError(HmSfmError):
-    """A weights file is damaged, foreign or does not fit the configured network."""
+    """A weights file is damaged, is not one of hm_sfm's, or does not fit the configured network."""
 
 
 class StaleResultError(HmSfmError):
-    """A stored result was made from other inputs or another configuration than the present ones."""
+    """A stored result was made from other inputs or with another configuration than the present ones."""
 
 
 class MissingPackageError(HmSfmError):
@@ -28,10 +28,10 @@ class MissingPackageError(HmSfmError):
 
 
 class WorkerLostError(HmSfmError):
-    """Processes that matched pairs died again and again."""
+    """The processes that match pairs died again and again."""
 
 
 class NoModelError(HmSfmError):
-    """The mapper found no model; database and matches are kept."""
+    """The mapper could not build a model; database and matches are kept."""
 
     exit_code = 3

@@ -224,7 +224,7 @@ def test_the_fingerprint_changes_with_any_value(name, value):
     section, key = name.split(".")
     other = {str: "other", int: 4711, float: 0.4711, bool: not value}[type(value)]
     for words in (words for *names, words in WORDS if names == [section, key]):
-        other = words[-1]
+        other = next(word for word in words if word != value)
     changed = dataclasses.replace(
         Config(), **{section: dataclasses.replace(getattr(Config(), section), **{key: other})}
     )

@@ -89,8 +89,10 @@ class MatchingConfig:
     """A file with coarse matches of any other matcher instead, in the format of hloc or of its match_dense."""
     coarse_features: str = ""
     """A file with the keypoints, in hloc's format, if coarse_matches holds indices of keypoints."""
-    coarse_threshold: float = 0.8
-    """light: least cosine similarity of a coarse match."""
+    min_cosine: float = 0.8
+    """Least cosine similarity of a coarse match where cells are matched by plain features (network.coarse cosine)."""
+    min_confidence: float = 0.2
+    """Least confidence of a coarse match where cells are matched by a dual softmax (theta_c of LoFTR's section 3.3)."""
     max_matches: int = 8000
     """The matches with the best scores that are kept per pair."""
     grow_below: int = 300
@@ -196,7 +198,10 @@ class Config:
 
 
 RENAMED: dict[type, dict[str, str]] = {
-    MatchingConfig: {"retry_turned": "matching.try_hypotheses"},
+    MatchingConfig: {
+        "retry_turned": "matching.try_hypotheses",
+        "coarse_threshold": "matching.min_cosine or matching.min_confidence",
+    },
     KeypointConfig: {
         "carry_score": "keypoints.propagation_min_score",
         "carry_radius_px": "keypoints.propagation_radius_px",

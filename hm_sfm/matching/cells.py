@@ -4,17 +4,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hm_sfm.config import MatchingConfig
 from hm_sfm.matching.encoder import Encoder
 from hm_sfm.network.device import autocast
+from hm_sfm.network.homonet import HomoNet
 from hm_sfm.photos.images import PreparedImage
 
 
 class CoarseCells:
     """Encodes and matches the coarse cells of a network: a CellMatcher."""
 
-    def __init__(self, encoder: Encoder, threshold: float) -> None:
-        """threshold: the least score of a match, see MatchingConfig.coarse_threshold."""
-        self.encoder, self.threshold = encoder, threshold
+    def __init__(self, encoder: Encoder, config: MatchingConfig) -> None:
+        self.encoder, self.threshold = encoder, choose_threshold(encoder.net, config)
 
     def encode(self, image: PreparedImage) -> Tensor:
         """(H, W, C) float32: the cells of an image on their grid."""
@@ -31,3 +32,8 @@ class CoarseCells:
         with autocast(self.encoder.device):
             index0, index1, score = self.encoder.net.coarse.match(flat0, flat1, self.threshold)
         return index0.cpu().numpy(), index1.cpu().numpy(), score.float().cpu().numpy()
+
+
+def choose_threshold(net: HomoNet, config: MatchingConfig) -> float:
+    """The least score of a coarse match: a cosine or a confidence, whichever the network's coarse stage gives."""
+    return config.min_cosine if net.config.coarse == "cosine" else config.min_confidence

@@ -47,7 +47,7 @@ class HomoMatcher:
         self.cell_matcher: CellMatcher | None = None
         """Compares rotation and scale hypotheses; None where the configuration does without them."""
         if config.try_hypotheses:
-            self.cell_matcher = CoarseCells(encoder, config.coarse_threshold)
+            self.cell_matcher = CoarseCells(encoder, config)
 
     @classmethod
     def from_network(cls, net: HomoNet, config: MatchingConfig, images: ImageConfig) -> "HomoMatcher":

@@ -13,7 +13,7 @@ from hm_sfm.network.resnet import LoftrBackbone
 class HomoNet(nn.Module):
     """Backbone, coarse stage and fine head, called one by one: features once per image, the rest per pair.
 
-    Raises ConfigError where the configuration names no known backbone or head, or an impossible size.
+    Raises ConfigError where a size of the configuration is impossible.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -30,21 +30,15 @@ class HomoNet(nn.Module):
                 f"network.spacing must be a power of 2 up to {(config.window - 1) // 2}, half of network.window, found "
                 f"{spacing}"
             )
-        if config.backbone not in ("light", "loftr"):
-            raise ConfigError(f"network.backbone must be light or loftr, found {config.backbone!r}")
         light = config.backbone == "light"
         self.backbone = LightBackbone() if light else LoftrBackbone()
         if config.coarse == "attention":
             self.coarse = AttentionCoarse() if light else LoftrCoarse()
         elif config.coarse == "aspan":
             self.coarse = AspanCoarse(channels=64, heads=4, blocks=2) if light else AspanCoarse()
-        elif config.coarse == "cosine":
-            self.coarse = CosineCoarse()
         else:
-            raise ConfigError(f"network.coarse must be attention, aspan or cosine, found {config.coarse!r}")
+            self.coarse = CosineCoarse()
         if config.head == "homography":
             self.head = HomographyHead(config.window, config.radius, config.iterations, config.margin, spacing)
-        elif config.head == "expectation":
-            self.head = ExpectationHead(config.window, config.margin)
         else:
-            raise ConfigError(f"network.head must be homography or expectation, found {config.head!r}")
+            self.head = ExpectationHead(config.window, config.margin)

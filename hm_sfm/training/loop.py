@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -108,7 +109,7 @@ class TrainConfig:
     """Of the exponential moving average of the weights, which is what is validated and exported."""
     precision: str = "auto"
     """auto (bf16 for convolutions and matrix products) | fp32."""
-    device: str = "auto"
+    device: Literal["auto", "cpu", "cuda"] = "auto"
     validate_every: int = 500
     coarse_threshold: float = 0.2
     """Least confidence of a coarse match, where held-out pairs are matched."""

@@ -15,6 +15,7 @@ from torch import Tensor
 from hm_sfm.config import ImageConfig, MatchingConfig, fingerprint
 from hm_sfm.evaluation.relative_poses import PosePair, read_strecha_pairs, score_poses
 from hm_sfm.io.atomic import replace_file, write_json
+from hm_sfm.matching.cells import choose_threshold
 from hm_sfm.matching.encoder import pad_image
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.patches import FINE_CHUNK
@@ -97,17 +98,15 @@ def score_once(path: Path, score: Callable[[], Scores]) -> Scores:
 
 
 def make_matcher(net: HomoNet, config: TrainConfig) -> HomoMatcher:
-    """The network with the threshold that its coarse stage is trained for: a similarity for plain features."""
-    threshold = MatchingConfig().coarse_threshold if net.config.coarse == "cosine" else config.coarse_threshold
-    return HomoMatcher.from_network(
-        net, MatchingConfig(coarse_threshold=threshold, device=config.device), ImageConfig()
-    )
+    """The network with the threshold of confidence that its coarse stage is trained for."""
+    matching = MatchingConfig(min_confidence=config.coarse_threshold, device=config.device)
+    return HomoMatcher.from_network(net, matching, ImageConfig())
 
 
 def score_cells(net: HomoNet, trial: Trial) -> Scores:
     """`recall` and `precision` of a network's coarse stage, and `real` ones on real photos, in percent."""
     matcher, batches = make_matcher(net, trial.config), [collate_pairs([pair]) for pair in (*trial.known, *trial.real)]
-    threshold, precision = matcher.config.coarse_threshold, trial.config.precision
+    threshold, precision = choose_threshold(net, matcher.config), trial.config.precision
     scores = score_network(net, batches, "coarse", 0, threshold, precision, matcher.device, torch.Generator())
     return {name.replace("rendered_", "").replace("_", " "): value for name, value in scores.items()}
 
@@ -165,7 +164,7 @@ def time_stages(matcher: HomoMatcher, pair: PosePair) -> Scores:
 
     def run_coarse() -> Tensor:
         cells = [net.coarse.describe(view.coarse)[0].flatten(1).T.contiguous() for view in views]
-        return net.coarse.match(*cells, matcher.config.coarse_threshold)[0]
+        return net.coarse.match(*cells, choose_threshold(net, matcher.config))[0]
 
     def run_fine() -> Tensor:
         for cell0, cell1 in zip(*(each.split(FINE_CHUNK) for each in cells)):

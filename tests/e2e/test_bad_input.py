@@ -196,7 +196,7 @@ def test_out_of_other_photos(out, tmp_path, run, digest_files):
     assert digest_files(out) == before
 
 
-@pytest.mark.parametrize("setting", ["images.long_edge_px=256", "matching.coarse_threshold=0.7"])
+@pytest.mark.parametrize("setting", ["images.long_edge_px=256", "matching.min_cosine=0.7"])
 def test_out_of_another_configuration(setting, scene, out, run, digest_files):
     before = digest_files(out)
     key, value = setting.split("=")

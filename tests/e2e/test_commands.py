@@ -219,7 +219,7 @@ def test_train_makes_weights_that_match_uses(scene, tmp_path, run, read_matches)
 
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("view_00.jpg view_01.jpg\n")
-    matching = ("--pairs", pairs, "--model", weights, "--set", "matching.coarse_threshold=0.0")
+    matching = ("--pairs", pairs, "--model", weights, "--set", "matching.min_cosine=0.0")
     assert run("match", scene.images, tmp_path / "out", *matching).code == 0
     assert list(read_matches(tmp_path / "out" / "matches.h5")) == [("view_00.jpg", "view_01.jpg")]
 

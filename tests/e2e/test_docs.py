@@ -65,7 +65,7 @@ def test_commands_within_a_sentence_parse_as_far_as_they_go():
         try:
             make_parser().parse_args(shlex.split(line))
         except InputError as error:
-            assert "the following arguments are required" in str(error), line  # noqa: PT017
+            assert "the following arguments are required" in str(error), line
 
 
 def test_the_table_of_commands_is_complete():

@@ -100,8 +100,8 @@ def test_shards_of_other_settings_counts_and_photos_are_refused(tiny_photos, tmp
     for shard in ("1/2", "2/2"):
         assert run("match", photos, out, "--shard", shard).code == 0
     before = digest_files(out)
-    setting = ("--set", "matching.coarse_threshold=0.7")
-    assert_refused(run("merge", photos, out, *setting), "matches.shard-1-of-2.h5", "matching.coarse_threshold")
+    setting = ("--set", "matching.min_cosine=0.7")
+    assert_refused(run("merge", photos, out, *setting), "matches.shard-1-of-2.h5", "matching.min_cosine")
     assert digest_files(out) == before
     assert run("match", photos, out, "--shard", "4/4").code == 0
     assert_refused(run("merge", photos, out), out, "shards of 2 and of 4")

@@ -206,7 +206,7 @@ def test_patches_in_chunks_equal_patches_at_once(monkeypatch):
     net = HomoNet(NetworkConfig())
     for layer in (net.head.corners, net.head.scale):
         torch.nn.init.normal_(layer.weight, std=0.1)
-    matcher = HomoMatcher.from_network(net, MatchingConfig(device="cpu", coarse_threshold=0.0), ImageConfig())
+    matcher = HomoMatcher.from_network(net, MatchingConfig(device="cpu", min_cosine=0.0), ImageConfig())
     pixels = np.random.default_rng(0).integers(0, 256, (96, 128), dtype=np.uint8)
     features0, features1 = (matcher.encode(prepare_array(image, 128)) for image in (pixels, pixels[::-1]))
     whole = matcher.match_features(features0, features1)

@@ -110,7 +110,7 @@ def test_linear_attention_equals_the_quadratic_form():
 @pytest.mark.slow
 def test_a_loftr_checkpoint_matches_images(checkpoint):
     net = load_weights(str(checkpoint), LOFTR)
-    matcher = HomoMatcher.from_network(net, MatchingConfig(coarse_threshold=0.0), ImageConfig(long_edge_px=128))
+    matcher = HomoMatcher.from_network(net, MatchingConfig(min_confidence=0.0), ImageConfig(long_edge_px=128))
     noise = np.random.default_rng(0).integers(0, 255, (100, 120), dtype=np.uint8)
     image = cv2.GaussianBlur(noise, (0, 0), 2)
     matches = matcher.match(image, image)
@@ -137,7 +137,7 @@ def test_the_papers_networks_run(name):
     config = load_config(f"configs/{name}.yaml")
     torch.manual_seed(0)
     matcher = HomoMatcher.from_network(
-        HomoNet(config.network), MatchingConfig(coarse_threshold=0.0), ImageConfig(long_edge_px=96)
+        HomoNet(config.network), MatchingConfig(min_confidence=0.0), ImageConfig(long_edge_px=96)
     )
     image = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (96, 96), dtype=np.uint8), (0, 0), 2)
     matches = matcher.match(image, image)

@@ -346,7 +346,7 @@ def test_the_papers_networks_run(name, window, radius):
     torch.manual_seed(0)
     net = HomoNet(network)
     assert isinstance(net.coarse, AspanCoarse) and len(net.coarse.blocks) == 4 and net.coarse.channels == 256
-    matcher = HomoMatcher.from_network(net, MatchingConfig(coarse_threshold=0.0), ImageConfig(long_edge_px=96))
+    matcher = HomoMatcher.from_network(net, MatchingConfig(min_confidence=0.0), ImageConfig(long_edge_px=96))
     image = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (72, 96), dtype=np.uint8), (0, 0), 2)
     matches = matcher.match(image, image[:, :80])
     assert len(matches) > 0 and np.isfinite(matches.homography).all()

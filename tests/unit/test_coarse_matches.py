@@ -272,14 +272,13 @@ def write_loftr(path: Path) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("write", [write_attention, write_loftr])
-def test_other_weights_find_what_they_find_themselves(photos, tmp_path, monkeypatch, write):
-    monkeypatch.setattr(weights, "LEAST_CONFIDENCE", 1e-9)
+def test_other_weights_find_what_they_find_themselves(photos, tmp_path, write):
     path = write(tmp_path / "other.pt")
-    matcher = HomoMatcher.from_pretrained(config=MatchingConfig(coarse=str(path), device="cpu"))
+    matcher = HomoMatcher.from_pretrained(config=MatchingConfig(coarse=str(path), min_confidence=1e-9, device="cpu"))
     found = matcher.provider.match(*(matcher.encode(prepare_array(photo, 1024)) for photo in photos))
 
     net = load_weights(str(path), weights.LOFTR if write is write_loftr else None)
-    own = HomoMatcher.from_network(net, MatchingConfig(coarse_threshold=1e-9, device="cpu"), ImageConfig())
+    own = HomoMatcher.from_network(net, MatchingConfig(min_confidence=1e-9, device="cpu"), ImageConfig())
     expected = own.provider.match(*(own.encode(prepare_array(photo, 1024)) for photo in photos))
     assert len(found) == len(expected) > 20
     np.testing.assert_allclose(found.score, expected.score, rtol=1e-4)

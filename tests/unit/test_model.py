@@ -183,10 +183,10 @@ def test_the_digest_is_that_of_the_file(tmp_path):
     assert digest_weights(str(path)) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
-@pytest.mark.parametrize("name", ["tpu", "cuda"] if not torch.cuda.is_available() else ["tpu"])
-def test_unknown_and_absent_devices_are_refused(name):
-    with pytest.raises(ConfigError, match=name):
-        pick_device(name)
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA GPU")
+def test_an_absent_device_is_refused():
+    with pytest.raises(ConfigError, match="cuda"):
+        pick_device("cuda")
 
 
 # Matching
@@ -308,7 +308,7 @@ def test_flat_images_are_no_trouble(matcher, value):
 
 
 def test_no_matches_at_all():
-    strict = HomoMatcher.from_pretrained("light", config=MatchingConfig(coarse_threshold=1.1))
+    strict = HomoMatcher.from_pretrained("light", config=MatchingConfig(min_cosine=1.1))
     found = strict.match(make_texture(96, 64), make_texture(96, 64))
     assert len(found) == 0 and found.homography.shape == (0, 3, 3)
     xy1, valid = found.warp(np.array([[3.0, 4.0]]))

@@ -69,7 +69,7 @@ def make_provider(config: MatchingConfig, encoder: Encoder) -> CoarseProvider:
         return LightGlueCoarse(encoder.device)
     if config.coarse == "xfeat":
         return XfeatCoarse(encoder.device)
-    return NetworkCoarse(CoarseCells(encoder, config.coarse_threshold))
+    return NetworkCoarse(CoarseCells(encoder, config))
 
 
 def describe_coarse(config: MatchingConfig) -> dict[str, str]:

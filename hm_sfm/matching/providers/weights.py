@@ -15,8 +15,6 @@ from hm_sfm.photos.images import PreparedImage
 
 LOFTR = NetworkConfig(backbone="loftr", head="expectation", coarse="attention", iterations=1, margin=0)
 """What a public LoFTR checkpoint holds; its fine stage is left alone."""
-LEAST_CONFIDENCE = 0.2
-"""theta_c of a dual softmax, LoFTR's section 3.3; plain features are matched by matching.coarse_threshold instead."""
 
 
 class WeightsCoarse:
@@ -27,8 +25,7 @@ class WeightsCoarse:
 
     def __init__(self, weights: Path, config: MatchingConfig, device: torch.device) -> None:
         net = load_weights(str(weights), None if "network" in read_checkpoint(weights) else LOFTR)
-        threshold = config.coarse_threshold if net.config.coarse == "cosine" else LEAST_CONFIDENCE
-        self.cells = CoarseCells(Encoder(net, device), threshold)
+        self.cells = CoarseCells(Encoder(net, device), config)
 
     def describe(self, image: PreparedImage) -> dict[str, Any]:
         """`cells` (H, W, C) float32."""

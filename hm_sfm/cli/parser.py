@@ -115,7 +115,7 @@ def make_parser() -> argparse.ArgumentParser:
          "The configuration names the stage to train, the photos, the output folder and the weights to start from. On "
          "several GPUs: torchrun --nproc-per-node N -m hm_sfm.cli train ..."),
     ):  # fmt: skip
-        command = subparsers.add_parser(name, help=text, description=f"{text}. {more}")
+        command = subparsers.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}. {more}")
         command.add_argument("--quiet", action="store_true", help="show no progress bars and no warnings")
         add_options(command)
         command.set_defaults(run=run)

@@ -262,6 +262,10 @@ def test_a_damaged_matches_file(content, scene, out, run):
         (["--set", "images.long_edge_px=large"], ["images.long_edge_px must be of type int", "'large'"]),
         (["--set", "images.long_edge_px"], ["section.key=value"]),
         (["--set", "images.long_edge_px=16"], ["images.long_edge_px must be at least 32", "16"]),
+        (
+            ["--set", "keypoints.carry_score=0.5"],
+            ["the key 'keypoints.carry_score' is now called keypoints.propagation_min_score"],
+        ),
         (["--set", "network.head=magic"], ["network.head must be homography or expectation, found 'magic'"]),
         (["--config", "none.yaml"], ["none.yaml", "No such file"]),
         (["--camera-mode", "triple"], ["cameras.mode must be auto, single", "'triple'"]),
@@ -281,6 +285,9 @@ def test_an_unknown_key_in_a_configuration_file(scene, tmp_path, run):
     config.write_text("keypoints: {max_keypoint: 10}\n")
     finished = run("match", scene.images, tmp_path / "out", "--config", config)
     assert_refused(finished, config, "'max_keypoint'", "did you mean 'max_keypoints'")
+    config.write_text("matching: {retry_turned: false}\n")
+    finished = run("match", scene.images, tmp_path / "out", "--config", config)
+    assert_refused(finished, f"{config}: the key 'matching.retry_turned' is now called matching.try_hypotheses")
     config.write_text("keypoints: {max")
     assert_refused(run("match", scene.images, tmp_path / "out", "--config", config), config, "not valid YAML")
 

@@ -28,12 +28,12 @@ def write(path: Path, text: str) -> Path:
 
 def leaves(config, prefix: str = "") -> list[tuple[str, object]]:
     """All values of a configuration by their dotted keys."""
-    found = []
+    values = []
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         name = prefix + field.name
-        found += leaves(value, name + ".") if dataclasses.is_dataclass(value) else [(name, value)]
-    return found
+        values += leaves(value, name + ".") if dataclasses.is_dataclass(value) else [(name, value)]
+    return values
 
 
 def test_the_default_file_spells_out_the_defaults():

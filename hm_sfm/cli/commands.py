@@ -116,7 +116,8 @@ def run_frames(options: argparse.Namespace) -> int:
 def run_demo(options: argparse.Namespace) -> int:
     from hm_sfm.evaluation.poses import score_model
     from hm_sfm.formats.strecha import read_strecha_cameras
-    from hm_sfm.pipeline.reconstruction import claim_folder, reconstruct
+    from hm_sfm.pipeline.output_folder import claim_folder
+    from hm_sfm.pipeline.reconstruction import reconstruct
     from hm_sfm.synthetic.demo import write_demo
 
     claim_folder(options.out)

@@ -157,6 +157,12 @@ def verify_pairs(
     return verified
 
 
+def rank_pairs(verified: Mapping[ImagePair, VerifiedPair]) -> tuple[ImagePair, ...]:
+    """The verified pairs, strongest first."""
+    ranked = sorted(verified.values(), key=lambda checked: (-checked.strength, checked.pair))
+    return tuple(checked.pair for checked in ranked)
+
+
 def is_convincing(inliers: int, matches: int, config: VerificationConfig) -> bool:
     """Whether so many inliers among so many matches prove that two photos show the same place."""
     certainty = min(inliers / config.sure_inliers, 1.0)

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from hm_sfm.errors import MissingPackageError
-from hm_sfm.evaluation.comparison import AUC_SHOWN_DEG, Comparison, MethodResult
+from hm_sfm.evaluation.compared_methods import AUC_SHOWN_DEG, MethodResult
+from hm_sfm.evaluation.comparison import Comparison
 from hm_sfm.io.atomic import replace_file, write_json
 
 STAGES = ("match", "keypoints", "verify", "map")

@@ -8,12 +8,12 @@ from functools import lru_cache
 import numpy as np
 import torch
 
-from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.matching.encoder import Encoder
 from hm_sfm.matching.patches import estimate_patches, locate_patches, make_start, round_to_cells
 from hm_sfm.network.device import computes_in_half
 from hm_sfm.network.fine import FineMap
 from hm_sfm.photos.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
-from hm_sfm.photos.images import PreparedImage, prepare_image
+from hm_sfm.photos.images import prepare_image
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
 ITERATIONS = 1
@@ -53,22 +53,22 @@ class Placement:
 class PatchRefiner:
     """Estimates patches around keypoints, on photos whose longer sides are reduced to `long_edge_px`.
 
-    The features of the photos used last are kept, as many as fit into matching.feature_cache_mb.
+    The features of the photos used last are kept: as many as fit into cache_mb, but of two photos at least.
     """
 
-    def __init__(self, matcher: HomoMatcher, images: Sequence[ImageRef], long_edge_px: int) -> None:
-        self.matcher, self.long_edge_px = matcher, long_edge_px
+    def __init__(self, encoder: Encoder, images: Sequence[ImageRef], long_edge_px: int, cache_mb: int) -> None:
+        self.encoder, self.long_edge_px = encoder, long_edge_px
         self.images = {image.name: image for image in images}
         largest_px = max((math.prod(size_at(image, long_edge_px)) for image in images), default=1)
-        backbone = matcher.net.backbone
-        bytes_per_number = 2 if computes_in_half(matcher.device) else 4
+        backbone = encoder.net.backbone
+        bytes_per_number = 2 if computes_in_half(encoder.device) else 4
         bytes_per_px = bytes_per_number * backbone.fine_channels / backbone.fine_grid.stride**2
-        self.cached_photos = max(2, int(matcher.config.feature_cache_mb * 1e6 / (largest_px * bytes_per_px)))
+        self.cached_photos = max(2, int(cache_mb * 1e6 / (largest_px * bytes_per_px)))
         self.encode = lru_cache(self.cached_photos)(self._encode)
 
     def _encode(self, name: str, hypothesis: Hypothesis) -> RefinementFeatures:
-        image = prepare_image(self.images[name], self.long_edge_px)
-        return encode_for_refinement(self.matcher, image, hypothesis)
+        image = apply_hypothesis(prepare_image(self.images[name], self.long_edge_px), hypothesis)
+        return RefinementFeatures(self.encoder.encode_fine(image), image.stored_from_scaled, hypothesis.downscale)
 
     def refine_pair(self, pair: ImagePair, placement: Placement) -> PairMatches:
         """Matches in the order of `placement`, from where its keypoints lie in the first photo.
@@ -78,7 +78,37 @@ class PatchRefiner:
         """
         names = (pair.name0, pair.name1)
         hypotheses = fit_hypotheses(relate_inputs(*(self.encode(name, IDENTITY) for name in names), placement))
-        return estimate_pair(self.matcher, *map(self.encode, names, hypotheses), pair, placement)
+        return self._estimate(*map(self.encode, names, hypotheses), pair, placement)
+
+    @torch.inference_mode()
+    def _estimate(
+        self, features0: RefinementFeatures, features1: RefinementFeatures, pair: ImagePair, placement: Placement
+    ) -> PairMatches:
+        grid, head, device = self.encoder.net.backbone.fine_grid, self.encoder.net.head, self.encoder.device
+        scaled0, scaled1 = (np.linalg.inv(features.stored_from_scaled) for features in (features0, features1))
+        xy0, xy1 = (
+            xy @ scaled[:2, :2].T + scaled[:2, 2] for xy, scaled in ((placement.xy0, scaled0), (placement.xy1, scaled1))
+        )
+        cell0, offset0 = round_to_cells(xy0, grid)
+        cell1, offset1 = round_to_cells(xy1, grid)
+        start = make_start(offset0, offset1, relate_inputs(features0, features1, placement), head.half).to(device)
+        estimates = estimate_patches(
+            head, features0.fine, features1.fine, cell0.to(device), cell1.to(device), start, ITERATIONS
+        )
+        patches = locate_patches(
+            estimates, offset0, features0.stored_from_scaled, features1.stored_from_scaled, grid, head.half
+        )
+        score = patches.score
+        if features1.downscale > 1:  # a px of the photo at `long_edge_px` is less than one of the reduced input
+            score = 1 - (1 - score) ** (1 / features1.downscale)
+        return PairMatches(
+            pair=pair,
+            xy0=placement.xy0,
+            xy1=patches.xy1,
+            score=np.where(patches.regular, score, 0.0),
+            homography=patches.homography,
+            patch_radius_px=patches.patch_radius_px,
+        )
 
 
 def size_at(image: ImageRef, long_edge_px: int) -> tuple[float, float]:
@@ -102,47 +132,3 @@ def fit_hypotheses(linear: np.ndarray) -> tuple[Hypothesis, Hypothesis]:
     rotation_deg = -90 * round(np.rad2deg(np.arctan2(across, along)) / 90) % 360
     octaves = round(np.log2(np.sqrt(np.median(np.abs(np.linalg.det(linear))))))
     return Hypothesis(downscale=2 ** max(0, -octaves)), Hypothesis(rotation_deg, 2 ** max(0, octaves))
-
-
-def encode_for_refinement(
-    matcher: HomoMatcher, image: PreparedImage, hypothesis: Hypothesis = IDENTITY
-) -> RefinementFeatures:
-    """The fine features of a photo."""
-    image = apply_hypothesis(image, hypothesis)
-    return RefinementFeatures(matcher.encoder.encode_fine(image), image.stored_from_scaled, hypothesis.downscale)
-
-
-@torch.inference_mode()
-def estimate_pair(
-    matcher: HomoMatcher,
-    features0: RefinementFeatures,
-    features1: RefinementFeatures,
-    pair: ImagePair,
-    placement: Placement,
-) -> PairMatches:
-    """PatchRefiner.refine_pair by the features of the two photos."""
-    grid, head = matcher.net.backbone.fine_grid, matcher.net.head
-    scaled0, scaled1 = (np.linalg.inv(features.stored_from_scaled) for features in (features0, features1))
-    xy0, xy1 = (
-        xy @ scaled[:2, :2].T + scaled[:2, 2] for xy, scaled in ((placement.xy0, scaled0), (placement.xy1, scaled1))
-    )
-    linear = relate_inputs(features0, features1, placement)
-    cell0, offset0 = round_to_cells(xy0, grid)
-    cell1, offset1 = round_to_cells(xy1, grid)
-    start = make_start(offset0, offset1, linear, head.half).to(matcher.device)
-    cells = cell0.to(matcher.device), cell1.to(matcher.device)
-    estimates = estimate_patches(head, features0.fine, features1.fine, *cells, start, ITERATIONS)
-    patches = locate_patches(
-        estimates, offset0, features0.stored_from_scaled, features1.stored_from_scaled, grid, head.half
-    )
-    score = patches.score
-    if features1.downscale > 1:  # a px of the photo at `long_edge_px` is less than one of the reduced input
-        score = 1 - (1 - score) ** (1 / features1.downscale)
-    return PairMatches(
-        pair=pair,
-        xy0=placement.xy0,
-        xy1=patches.xy1,
-        score=np.where(patches.regular, score, 0.0),
-        homography=patches.homography,
-        patch_radius_px=patches.patch_radius_px,
-    )

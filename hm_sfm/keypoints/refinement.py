@@ -20,7 +20,7 @@ from hm_sfm.keypoints.graph import KeypointGraph, Photo, TrackEdges
 from hm_sfm.keypoints.propagation import choose_good
 from hm_sfm.keypoints.refined_patches import PatchRefiner, Placement
 from hm_sfm.keypoints.transfer import differentiate
-from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.matching.encoder import Encoder
 from hm_sfm.matching.order import order_pairs
 from hm_sfm.matching.store import MatchStore
 from hm_sfm.network.fine import HomographyHead
@@ -41,18 +41,19 @@ MIN_CONFIRMED = 300
 class KeypointRefiner:
     """Predicts the edges of a keypoint graph anew, on photos whose longer sides are reduced to `long_edge_px`.
 
-    images: the photos of the graph, in its order. matches: the store of the matches that the graph was made from. What
-    is refined is kept in REFINED_FILE beside it, pair by pair; an interrupted run goes on from there.
+    encoder: the matcher's. images: the photos of the graph, in its order. matches: the store of the matches that the
+    graph was made from; what is refined is kept in REFINED_FILE beside it, pair by pair, and an interrupted run goes on
+    from there. cache_mb: memory for the features of photos.
 
     Raises ConfigError where the network has no homography head.
     """
 
     def __init__(
-        self, matcher: HomoMatcher, images: Sequence[ImageRef], long_edge_px: int, matches: MatchStore
+        self, encoder: Encoder, images: Sequence[ImageRef], long_edge_px: int, matches: MatchStore, cache_mb: int
     ) -> None:
-        if not isinstance(matcher.net.head, HomographyHead):
+        if not isinstance(encoder.net.head, HomographyHead):
             raise ConfigError("keypoints.refine_long_edge_px needs network.head homography, found expectation")
-        self.patches = PatchRefiner(matcher, images, long_edge_px)
+        self.patches = PatchRefiner(encoder, images, long_edge_px, cache_mb)
         self.images, self.long_edge_px = tuple(images), long_edge_px
         self.path, self.digests = matches.path.with_name(REFINED_FILE), matches.digests
         self.made_by = {**matches.made_by, "keypoints.refine_long_edge_px": long_edge_px}

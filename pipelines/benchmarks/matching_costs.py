@@ -78,7 +78,7 @@ def time_hm_sfm(_: str, images: Sequence[Any], config: Config) -> tuple[dict[str
     from hm_sfm.matching.interfaces import ImageFeatures
     from hm_sfm.matching.matcher import HomoMatcher
     from hm_sfm.photos.images import prepare_image
-    from hm_sfm.pipeline.reconstruction import open_store
+    from hm_sfm.pipeline.output_folder import open_store
     from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
     matcher = HomoMatcher.from_pretrained(

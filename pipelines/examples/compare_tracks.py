@@ -16,46 +16,51 @@ import numpy as np
 from hm_sfm.colmap.cameras import make_cameras
 from hm_sfm.colmap.database import write_database
 from hm_sfm.colmap.mapping import MappingTask, map_incrementally, summarise_models
-from hm_sfm.colmap.verification import verify_database, verify_pairs
+from hm_sfm.colmap.models import read_tracks
+from hm_sfm.colmap.verification import rank_pairs, verify_database, verify_pairs
 from hm_sfm.config import Config
-from hm_sfm.evaluation.comparison import load_expectation, load_matcher, read_tracks
+from hm_sfm.evaluation.comparison import load_expectation
 from hm_sfm.evaluation.loftr_style import make_keypoints
 from hm_sfm.evaluation.poses import score_model
 from hm_sfm.formats.strecha import read_strecha_cameras
+from hm_sfm.keypoints.persistence import persist_keypoints
 from hm_sfm.matching.run import match_pairs
 from hm_sfm.matching.store import MatchStore, digest_image
 from hm_sfm.photos.images import list_images
-from hm_sfm.pipeline.reconstruction import (
-    choose_pairs,
-    claim_folder,
-    describe_matching,
-    measure_px_scales,
-    persist_verified,
-)
+from hm_sfm.pipeline.collection import choose_pairs, measure_px_scales
+from hm_sfm.pipeline.output_folder import claim_folder, describe_matching
+from hm_sfm.pipeline.run import load_matcher, make_refiner, seed_photos
 
 
 def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:
     config = Config()
     claim_folder(out)
     images = list_images(photos).images
-    pairs = choose_pairs(images, out, config)
+    homography_matcher = load_matcher(config)
+    pairs = choose_pairs(images, out, config, lambda: homography_matcher)
     cameras = make_cameras(images, config.cameras)
     px_scale = measure_px_scales(images, config)
 
     # Each head's matches of the same pairs, stored side by side.
     digests = {image.name: digest_image(image) for image in images}
     homographies = MatchStore(out / "homographies.h5", describe_matching(config), digests)
-    match_pairs(images, pairs, load_matcher(config), homographies)
-    matcher, made_by = load_expectation("light_expectation", config)
+    match_pairs(images, pairs, homography_matcher, homographies)
+    expectation_matcher, made_by = load_expectation("light_expectation", config)
     expectations = MatchStore(out / "expectations.h5", made_by, digests)
-    match_pairs(images, pairs, matcher, expectations)
+    match_pairs(images, pairs, expectation_matcher, expectations)
 
     # Three ways from matches to keypoints.
     camera_of = {image.name: cameras.cameras[index] for image, index in zip(images, cameras.camera_index)}
     verified = verify_pairs(images, pairs, homographies.read, camera_of, px_scale, config.verification)
     max_keypoints = config.keypoints.max_keypoints
     keypoints_and_matches = {
-        "persistent": persist_verified(images, verified, homographies, config),
+        "persistent": persist_keypoints(
+            seed_photos(images, config),
+            rank_pairs(verified),
+            lambda pair: homographies.read(pair).select(verified[pair].inliers),
+            config.keypoints,
+            make_refiner(homography_matcher, images, config, homographies),
+        ),
         "raw": make_keypoints(images, pairs, expectations.read, px_scale, None, max_keypoints),
         "snapped": make_keypoints(images, pairs, expectations.read, px_scale, 1, max_keypoints),
     }

@@ -21,7 +21,8 @@ from hm_sfm.config import Config
 from hm_sfm.formats.hloc import read_features, read_matches, write_features, write_matches
 from hm_sfm.formats.pairs_files import read_pairs, write_pairs
 from hm_sfm.photos.images import list_images
-from hm_sfm.pipeline.reconstruction import match_photos, measure_px_scales, verify_and_propagate
+from hm_sfm.pipeline.collection import measure_px_scales
+from hm_sfm.pipeline.reconstruction import match_photos
 
 
 def run_hloc_style_steps(photos: Path, out: Path) -> None:
@@ -29,17 +30,17 @@ def run_hloc_style_steps(photos: Path, out: Path) -> None:
     hloc = out / "hloc"
 
     # 1. Match: hm_sfm has matches first and keypoints afterwards.
-    matched = match_photos(photos, out, config)
+    run = match_photos(photos, out, config)
     hloc.mkdir(exist_ok=True)
-    write_pairs(hloc / "pairs.txt", matched.pairs)
+    write_pairs(hloc / "pairs.txt", run.pairs)
 
     # 2. Features: the keypoints that persist from image to image.
-    keypoints, matches = verify_and_propagate(matched, config)
-    px_scale = measure_px_scales(matched.images, config)
-    write_features(hloc / "features.h5", matched.images, keypoints, px_scale)
+    keypoints, matches = run.make_keypoints()
+    px_scale = measure_px_scales(run.images, config)
+    write_features(hloc / "features.h5", run.images, keypoints, px_scale)
 
     # 3. Matches, as indices into the features.
-    write_matches(hloc / "matches.h5", matched.pairs, keypoints, matches)
+    write_matches(hloc / "matches.h5", run.pairs, keypoints, matches)
 
     # 4. Reconstruction, from nothing but the photos and the three files.
     images = list_images(photos).images

@@ -11,12 +11,14 @@ from pathlib import Path
 from hm_sfm.colmap.cameras import make_cameras
 from hm_sfm.colmap.database import write_database
 from hm_sfm.colmap.mapping import MappingTask, map_incrementally, summarise_models
-from hm_sfm.colmap.verification import verify_database, verify_pairs
+from hm_sfm.colmap.verification import rank_pairs, verify_database, verify_pairs
 from hm_sfm.config import Config
-from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.keypoints.persistence import persist_keypoints
 from hm_sfm.matching.run import match_pairs
 from hm_sfm.photos.images import list_images
-from hm_sfm.pipeline.reconstruction import choose_pairs, claim_folder, measure_px_scales, open_store, persist_verified
+from hm_sfm.pipeline.collection import choose_pairs, measure_px_scales
+from hm_sfm.pipeline.output_folder import claim_folder, open_store
+from hm_sfm.pipeline.run import load_matcher, make_refiner, seed_photos
 
 
 def reconstruct_folder(photos: Path, out: Path) -> None:
@@ -25,11 +27,11 @@ def reconstruct_folder(photos: Path, out: Path) -> None:
 
     # The images, and which of them to match with which.
     images = list_images(photos).images
-    pairs = choose_pairs(images, out, config)
+    matcher = load_matcher(config)
+    pairs = choose_pairs(images, out, config, lambda: matcher)
     cameras = make_cameras(images, config.cameras)
 
     # Dense matches, each with the homography of its patch.
-    matcher = HomoMatcher.from_pretrained("light")
     store = open_store(out / "matches.h5", images, config)
     match_pairs(images, pairs, matcher, store)
 
@@ -39,7 +41,13 @@ def reconstruct_folder(photos: Path, out: Path) -> None:
     verified = verify_pairs(images, pairs, store.read, camera_of, px_scale, config.verification)
 
     # Keypoints that persist from image to image, and their matches.
-    keypoints, matches = persist_verified(images, verified, store, config)
+    keypoints, matches = persist_keypoints(
+        seed_photos(images, config),
+        rank_pairs(verified),
+        lambda pair: store.read(pair).select(verified[pair].inliers),
+        config.keypoints,
+        make_refiner(matcher, images, config, store),
+    )
 
     # From here on it is COLMAP.
     database = out / "database.db"

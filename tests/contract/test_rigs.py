@@ -18,7 +18,7 @@ from hm_sfm.colmap.verification import verify_database
 from hm_sfm.config import CameraConfig, Config, MappingConfig, PairConfig, VerificationConfig
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.photos.exif import write_jpeg
-from hm_sfm.pipeline.reconstruction import choose_pairs
+from hm_sfm.pipeline.collection import choose_pairs
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 RIG = [
@@ -170,11 +170,15 @@ def test_rigs_whose_poses_cannot_be_found_are_left_out(tmp_path, oracle, caplog)
 # Pairs
 
 
+def refuse_encoding():
+    raise AssertionError("no photo is to be encoded")
+
+
 def test_a_sequence_joins_the_photos_of_all_cameras(tmp_path):
     names = [f"{folder}/{number}.jpg" for folder in ("left", "right") for number in range(4)] + ["other.jpg"]
     images = [ImageRef(name, tmp_path / name, (60, 40)) for name in names]
     config = Config(pairs=PairConfig(mode="sequential", window=1), cameras=CameraConfig(rig=write_rig(tmp_path)))
-    pairs = choose_pairs(images, tmp_path / "out", config)
+    pairs = choose_pairs(images, tmp_path / "out", config, refuse_encoding)
     assert len(pairs) == len(set(pairs))
     for number in range(4):
         assert ImagePair(f"left/{number}.jpg", f"right/{number}.jpg") in pairs
@@ -182,7 +186,7 @@ def test_a_sequence_joins_the_photos_of_all_cameras(tmp_path):
         assert ImagePair(f"left/{number}.jpg", f"right/{number + 1}.jpg") in pairs
         assert ImagePair(f"left/{number + 1}.jpg", f"right/{number}.jpg") in pairs
     assert ImagePair("other.jpg", "right/3.jpg") in pairs
-    plain = choose_pairs(images, tmp_path / "out", dataclasses.replace(config, cameras=CameraConfig()))
+    plain = choose_pairs(images, tmp_path / "out", dataclasses.replace(config, cameras=CameraConfig()), refuse_encoding)
     assert set(plain) < set(pairs) and ImagePair("left/1.jpg", "right/1.jpg") not in plain
 
 

@@ -238,7 +238,7 @@ def test_a_full_disk_keeps_the_model_that_was_there(scene, out, run, monkeypatch
         raise OSError(28, "No space left on device", str(path))
 
     before = digest_files(out)
-    monkeypatch.setattr("hm_sfm.pipeline.reconstruction.write_database", refuse)
+    monkeypatch.setattr("hm_sfm.pipeline.run.write_database", refuse)
     finished = run("reconstruct", scene.images, out, "--quiet")
     assert_refused(finished, out / "database.db", "No space left on device")
     assert digest_files(out) == before

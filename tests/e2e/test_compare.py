@@ -160,8 +160,8 @@ def test_an_interrupted_comparison_goes_on(scene, reconstructed, expectation_wei
     assert (out / "loftr_style" / "matches.h5").exists() and not (out / "compare.json").exists()
 
     with monkeypatch.context() as patch:
-        patch.setattr("hm_sfm.evaluation.comparison.match_pairs", interrupt)
-        patch.setattr("hm_sfm.evaluation.comparison.reconstruct", interrupt)
+        patch.setattr("hm_sfm.pipeline.run.match_pairs", interrupt)
+        patch.setattr("hm_sfm.evaluation.comparison.build_model", interrupt)
         assert run(*command).code == 0
     assert (out / "persistent" / "result.json").stat().st_mtime_ns == kept
     methods = json.loads((out / "compare.json").read_text())["methods"]

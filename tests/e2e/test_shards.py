@@ -175,7 +175,7 @@ def test_shards_chosen_by_looks_encode_one_after_the_other(tiny_photos, tmp_path
         held.append(True)
         return np.full((6, 3), 3**-0.5, np.float32)  # all alike
 
-    monkeypatch.setattr("hm_sfm.pipeline.reconstruction.describe_images", encode)
+    monkeypatch.setattr("hm_sfm.pipeline.collection.describe_images", encode)
     finished = run("match", tiny_photos, out, "--pairs", "retrieval", "--shard", "1/1")
     assert finished.code == 0, finished.err
     assert held == [True]

@@ -29,7 +29,7 @@ from hm_sfm.network.checkpoints import load_weights, save_weights
 from hm_sfm.network.homography import apply_homography, homography_from_corners
 from hm_sfm.network.homonet import HomoNet
 from hm_sfm.photos.images import prepare_array
-from hm_sfm.pipeline.reconstruction import describe_matching
+from hm_sfm.pipeline.output_folder import describe_matching
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 SIZE_WH = (256, 192)

@@ -1,4 +1,4 @@
-"""What is kept of an interrupted comparison, and the figures of a model."""
+"""What is kept of an interrupted comparison, and the metrics of a model."""
 
 import dataclasses
 import json
@@ -9,29 +9,30 @@ import pycolmap
 import pytest
 
 from hm_sfm.colmap.cameras import Cameras
+from hm_sfm.colmap.models import read_tracks
 from hm_sfm.config import Config, MappingConfig
-from hm_sfm.evaluation.comparison import (
+from hm_sfm.evaluation.compared_methods import (
+    ComparisonTask,
     Method,
-    Run,
-    add_seconds,
     count_models,
     finish_method,
     measure_method,
     read_matched_tracks,
-    read_seconds,
-    read_tracks,
 )
+from hm_sfm.evaluation.comparison import add_seconds, read_seconds
+from hm_sfm.pipeline.collection import Collection
 from hm_sfm.types import ImagePair, ImageRef
 
 SECONDS = {"match": 1.239, "keypoints": None, "verify": 0.5, "map": 2.0}
 
 
 @pytest.fixture
-def run(tmp_path) -> Run:
+def task(tmp_path) -> ComparisonTask:
     images = tuple(ImageRef(name, Path(name), (640, 480)) for name in ("a.jpg", "b.jpg"))
     pairs = (ImagePair("a.jpg", "b.jpg"),)
     digests = {"a.jpg": "0", "b.jpg": "1"}
-    return Run(tmp_path, tmp_path, Config(), True, images, pairs, Cameras((), ()), digests, None)
+    collection = Collection(tmp_path, images, pairs, Cameras((), ()))
+    return ComparisonTask(collection, tmp_path, Config(), digests, None, quiet=True)
 
 
 def write_scene(folder: Path) -> pycolmap.Reconstruction:
@@ -47,91 +48,92 @@ def write_scene(folder: Path) -> pycolmap.Reconstruction:
 
 
 @pytest.fixture
-def method(run) -> Method:
+def method(task) -> Method:
     """Each build adds a model and a line to OUT/demo/builds."""
 
     def build():
-        write_scene(run.out / "demo")
-        with open(run.out / "demo" / "builds", "a") as file:
+        write_scene(task.out / "demo")
+        with open(task.out / "demo" / "builds", "a") as file:
             file.write("built\n")
         return dict(SECONDS)
 
     return Method("demo", {"weights": "abc"}, build)
 
 
-def count_builds(run: Run) -> int:
-    return len((run.out / "demo" / "builds").read_text().splitlines())
+def count_builds(task: ComparisonTask) -> int:
+    return len((task.out / "demo" / "builds").read_text().splitlines())
 
 
-def test_a_finished_method_is_kept(run, method):
-    first = finish_method(run, method)
+def test_a_finished_method_is_kept(task, method):
+    first = finish_method(task, method)
     assert first.registered == 4 and first.models == 1
     assert first.seconds == {"match": 1.24, "keypoints": None, "verify": 0.5, "map": 2.0}
-    assert finish_method(run, method) == first
-    assert count_builds(run) == 1
+    assert finish_method(task, method) == first
+    assert count_builds(task) == 1
 
 
 @pytest.mark.parametrize("change", ["settings", "matches", "photos", "pairs", "no model", "damaged", "foreign"])
-def test_a_stale_method_is_made_anew(run, method, change):
-    finish_method(run, method)
-    result = run.out / "demo" / "result.json"
+def test_a_stale_method_is_made_anew(task, method, change):
+    finish_method(task, method)
+    result = task.out / "demo" / "result.json"
     if change == "settings":
-        run = dataclasses.replace(run, config=Config(mapping=MappingConfig(seed=1)))
+        task = dataclasses.replace(task, config=Config(mapping=MappingConfig(seed=1)))
     elif change == "matches":
         method = dataclasses.replace(method, made_by={"weights": "abd"})
     elif change == "photos":
-        run = dataclasses.replace(run, digests={"a.jpg": "0", "b.jpg": "2"})
+        task = dataclasses.replace(task, digests={"a.jpg": "0", "b.jpg": "2"})
     elif change == "pairs":
-        run = dataclasses.replace(run, pairs=())
+        collection = dataclasses.replace(task.collection, pairs=())
+        task = dataclasses.replace(task, collection=collection)
     elif change == "no model":
-        (run.out / "demo" / "sparse" / "0" / "points3D.bin").unlink()
+        (task.out / "demo" / "sparse" / "0" / "points3D.bin").unlink()
     else:
         result.write_text('{"made_by"' if change == "damaged" else "[]")
-    finish_method(run, method)
-    assert count_builds(run) == 2
-    finish_method(run, method)
-    assert count_builds(run) == 2
+    finish_method(task, method)
+    assert count_builds(task) == 2
+    finish_method(task, method)
+    assert count_builds(task) == 2
 
 
-def test_an_interrupted_method_leaves_no_result(run, method):
-    finish_method(run, method)
+def test_an_interrupted_method_leaves_no_result(task, method):
+    finish_method(task, method)
 
     def build():
         raise KeyboardInterrupt
 
     interrupted = Method("demo", {"weights": "other"}, build)
     with pytest.raises(KeyboardInterrupt):
-        finish_method(run, interrupted)
-    assert not (run.out / "demo" / "result.json").exists()
-    finish_method(run, method)
-    assert count_builds(run) == 2
+        finish_method(task, interrupted)
+    assert not (task.out / "demo" / "result.json").exists()
+    finish_method(task, method)
+    assert count_builds(task) == 2
 
 
-def test_a_method_without_a_model_is_a_result_of_zeros(run):
+def test_a_method_without_a_model_is_a_result_of_zeros(task):
     def build():
-        with pycolmap.Database.open(run.out / "empty" / "database.db"):
+        with pycolmap.Database.open(task.out / "empty" / "database.db"):
             return dict(SECONDS)
 
-    found = finish_method(run, Method("empty", None, build))
+    found = finish_method(task, Method("empty", None, build))
     assert (found.registered, found.models, found.points, found.observations) == (0, 0, 0, 0)
     assert (found.matched_tracks, found.mean_matched_track_length) == (0, 0)
     assert (found.mean_track_length, found.median_track_length, found.observations_per_image) == (0, 0, 0)
     assert found.track_length_histogram == {} and found.auc_percent is None
-    assert json.loads((run.out / "empty" / "result.json").read_text())["models"] == 0
+    assert json.loads((task.out / "empty" / "result.json").read_text())["models"] == 0
 
 
-def test_figures_count_distinct_images(run):
-    model = write_scene(run.out / "demo")
+def test_metrics_count_distinct_images(task):
+    model = write_scene(task.out / "demo")
     image = model.images[min(model.images)]
     spare = next(index for index, point in enumerate(image.points2D) if not point.has_point3D())
     seen = next(point.point3D_id for point in image.points2D if point.has_point3D())
     model.add_observation(seen, pycolmap.TrackElement(image.image_id, spare))
-    model.write_binary(run.out / "demo" / "sparse" / "0")
-    assert count_models(run.out / "demo") == 1
+    model.write_binary(task.out / "demo" / "sparse" / "0")
+    assert count_models(task.out / "demo") == 1
 
     length = np.array([len({e.image_id for e in point.track.elements}) for point in model.points3D.values()])
     finished = {"models": 1, "seconds": SECONDS, "matched_tracks": 30, "mean_matched_track_length": 3.5}
-    found = measure_method(run, "demo", finished)
+    found = measure_method(task, "demo", finished)
     assert found.points == len(length) == sum(found.track_length_histogram.values())
     assert found.track_length_histogram == {n: int((length == n).sum()) for n in np.unique(length).tolist()}
     assert found.points_in_3_images == (length >= 3).sum()

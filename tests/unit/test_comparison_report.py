@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from hm_sfm.errors import MissingPackageError
-from hm_sfm.evaluation.comparison import Comparison, MethodResult
+from hm_sfm.evaluation.compared_methods import MethodResult
+from hm_sfm.evaluation.comparison import Comparison
 from hm_sfm.evaluation.comparison_report import (
     format_table,
     lay_out_histogram,

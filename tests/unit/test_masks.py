@@ -10,7 +10,6 @@ from hm_sfm.config import KeypointConfig, MaskConfig
 from hm_sfm.errors import InputError
 from hm_sfm.keypoints.graph import Photo
 from hm_sfm.keypoints.persistence import persist_keypoints
-from hm_sfm.matching.masked_store import MaskedStore
 from hm_sfm.photos.masks import Masks, read_masks
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
@@ -177,11 +176,7 @@ def make_masks() -> Masks:
 def test_matches_with_an_end_in_a_masked_pixel_are_dropped():
     matches = make_matches(10.0)
 
-    class Store:
-        def read(self, pair: ImagePair) -> PairMatches:
-            return matches
-
-    kept = MaskedStore(Store(), make_masks()).read(matches.pair)
+    kept = make_masks().drop_hidden(matches)
     right = (matches.xy0[:, 0] >= 80) & (matches.xy1[:, 1] < 60)
     assert 0 < right.sum() < len(matches)
     np.testing.assert_array_equal(kept.xy0, matches.xy0[right])

@@ -9,10 +9,10 @@ import pytest
 from hm_sfm.config import ImageConfig, KeypointConfig, MatchingConfig
 from hm_sfm.errors import ConfigError
 from hm_sfm.geometry.frames import homography_to_pixel_index
-from hm_sfm.keypoints import refined_patches, refinement
+from hm_sfm.keypoints import refinement
 from hm_sfm.keypoints.graph import KeypointGraph, Photo, PropagatedPoints, TrackEdges
 from hm_sfm.keypoints.persistence import collect_keypoints
-from hm_sfm.keypoints.refined_patches import encode_for_refinement, fit_hypotheses
+from hm_sfm.keypoints.refined_patches import fit_hypotheses
 from hm_sfm.keypoints.refinement import KeypointRefiner
 from hm_sfm.keypoints.transfer import differentiate
 from hm_sfm.matching.matcher import HomoMatcher
@@ -83,7 +83,7 @@ def connect_photos(photos, wrong: int = 0) -> KeypointGraph:
 def refine(graph, photos, matcher, folder, made_by=None, refine_long_edge_px: int = SIZE_WH[0]) -> KeypointGraph:
     digests = {photo.name: digest_image(photo) for photo in photos}
     matches = MatchStore(folder / "matches.h5", made_by or {}, digests)
-    return KeypointRefiner(matcher, photos, refine_long_edge_px, matches).refine(graph, quiet=True)
+    return KeypointRefiner(matcher.encoder, photos, refine_long_edge_px, matches, 500).refine(graph, quiet=True)
 
 
 def measure_errors(graph: KeypointGraph) -> np.ndarray:
@@ -174,8 +174,8 @@ def test_what_was_done_is_not_done_again_and_other_edges_are(photos, matcher, tm
     graph = connect_photos(photos)
     first = refine(graph, photos, matcher, tmp_path)
     encoded = []
-    encode = refined_patches.encode_for_refinement
-    monkeypatch.setattr(refined_patches, "encode_for_refinement", lambda *args: encoded.append(args) or encode(*args))
+    encode = matcher.encoder.encode_fine
+    monkeypatch.setattr(matcher.encoder, "encode_fine", lambda image: encoded.append(image) or encode(image))
     again = refine(graph, photos, matcher, tmp_path)
     assert not encoded
     for a, b in zip(first.edges, again.edges):
@@ -188,12 +188,12 @@ def test_what_was_done_is_not_done_again_and_other_edges_are(photos, matcher, tm
 
 def test_strips_make_the_features_of_the_whole(photos, matcher, monkeypatch):
     image = prepare_image(photos[0], SIZE_WH[0])
-    whole = encode_for_refinement(matcher, image)
+    whole = matcher.encoder.encode_fine(image)
     monkeypatch.setattr("hm_sfm.matching.encoder.STRIP_PX", 512)
-    strips = encode_for_refinement(matcher, image)
-    assert strips.fine.size_wh == whole.fine.size_wh == (SIZE_WH[0] // 2, SIZE_WH[1] // 2)
-    off = (strips.fine.cells - whole.fine.cells).abs().float()
-    assert off.mean() < 0.01 * whole.fine.cells.abs().float().mean()
+    strips = matcher.encoder.encode_fine(image)
+    assert strips.size_wh == whole.size_wh == (SIZE_WH[0] // 2, SIZE_WH[1] // 2)
+    off = (strips.cells - whole.cells).abs().float()
+    assert off.mean() < 0.01 * whole.cells.abs().float().mean()
 
 
 @pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])

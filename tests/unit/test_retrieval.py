@@ -25,7 +25,7 @@ from hm_sfm.pairs.retrieval import (
 )  # fmt: skip
 from hm_sfm.pairs.selection import select_pairs
 from hm_sfm.photos.images import CV_ROTATIONS, prepare_array, read_ref
-from hm_sfm.pipeline.reconstruction import choose_pairs
+from hm_sfm.pipeline.collection import choose_pairs
 from hm_sfm.synthetic.textures import make_texture
 from hm_sfm.types import ImageRef
 
@@ -290,25 +290,32 @@ def test_plain_features_are_those_that_the_coarse_stage_starts_from(backbone, co
         torch.testing.assert_close(plain, described[:, :64], atol=1e-2, rtol=0)
 
 
-def test_choosing_pairs_encodes_only_where_looks_matter(ring, tmp_path, monkeypatch):
+def test_choosing_pairs_encodes_only_where_appearance_matters(ring, tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(HomoMatcher, "from_pretrained", lambda *_, **__: asked.append(1) or ring)
-    monkeypatch.setattr("hm_sfm.pipeline.reconstruction.digest_image", lambda image: ring.digests[image.name])
-    exhaustive = choose_pairs(ring.images, tmp_path / "out", Config(), quiet=True)
+
+    def get_matcher():
+        asked.append(1)
+        return ring
+
+    monkeypatch.setattr("hm_sfm.pipeline.collection.digest_image", lambda image: ring.digests[image.name])
+    exhaustive = choose_pairs(ring.images, tmp_path / "out", Config(), get_matcher, quiet=True)
     assert len(exhaustive) == 60 * 59 // 2 and not asked and not (tmp_path / "out").exists()
     pairing, matching = PairConfig(mode="retrieval", retrieval_top=4), MatchingConfig(try_hypotheses=False)
     config = Config(pairs=pairing, matching=matching)
-    pairs = choose_pairs(ring.images, tmp_path / "out", config, quiet=True)
+    pairs = choose_pairs(ring.images, tmp_path / "out", config, get_matcher, quiet=True)
     assert 120 <= len(pairs) <= 240 and len(ring.encoded) == 60
     assert (tmp_path / "out" / ".hm_sfm").exists() and (tmp_path / "out" / "retrieval").is_dir()
-    assert choose_pairs(ring.images, tmp_path / "out", config, quiet=True) == pairs
+    assert choose_pairs(ring.images, tmp_path / "out", config, get_matcher, quiet=True) == pairs
     assert len(ring.encoded) == 60
 
 
 def test_choosing_pairs_by_position(tmp_path):
+    def refuse_encoding():
+        raise AssertionError("no photo is to be encoded")
+
     images = [
         ImageRef(f"{i}.jpg", tmp_path, (64, 64), 0, (48.0, 8.5 + i * 1e-5, 100.0) if i else None) for i in range(4)
     ]
     config = Config(pairs=PairConfig(mode="spatial"))
-    pairs = choose_pairs(images, tmp_path / "out", config, quiet=True)
+    pairs = choose_pairs(images, tmp_path / "out", config, refuse_encoding, quiet=True)
     assert {name for pair in pairs for name in (pair.name0, pair.name1)} == {"1.jpg", "2.jpg", "3.jpg"}

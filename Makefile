@@ -2,7 +2,7 @@
 #   make demo       reconstruct a rendered scene
 #   make check      style, imports and types
 #   make test-fast  the tests that are not slow, on all cores: before each commit
-#   make test       all tests
+#   make test       all tests: the fast ones, then the slow ones
 #   make test-lowest  the fast tests and the demo with the lowest versions that pyproject.toml admits (downloads GBs)
 #   make docs       docs/api.md, the reference of the Python API, from the docstrings
 
@@ -27,8 +27,8 @@ check: setup
 test-fast: setup
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -m "not slow" --numprocesses auto
 
-test: setup
-	$(VENV)/bin/python -m pytest
+test: test-fast
+	$(VENV)/bin/python -m pytest -m slow
 
 test-lowest:
 	PYTHON=$(PYTHON) .ci/lowest_versions

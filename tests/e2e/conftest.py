@@ -3,17 +3,20 @@
 import ctypes
 import dataclasses
 import hashlib
+import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import h5py
 import numpy as np
 import pytest
+from installation import build_wheel, install_alone
 
 from hm_sfm.cli import main
 from hm_sfm.matching.matcher import HomoMatcher
@@ -45,14 +48,18 @@ class Scene:
         return self.folder / "images"
 
 
+def finish(command: list[Any], **settings: Any) -> Finished:
+    """Run a command to its end, with subprocess.run's settings."""
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, **settings)
+    return Finished(done.returncode, done.stdout, done.stderr)
+
+
 @pytest.fixture(scope="session")
 def spawn() -> Callable[..., Finished]:
     """Run hm-sfm in a process of its own, as a user does."""
 
     def run_there(*arguments: object) -> Finished:
-        command = [sys.executable, "-m", "hm_sfm.cli", *map(str, arguments)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=600)
-        return Finished(done.returncode, done.stdout, done.stderr)
+        return finish([sys.executable, "-m", "hm_sfm.cli", *map(str, arguments)])
 
     return run_there
 
@@ -76,10 +83,23 @@ def run(capfd) -> Callable[..., Finished]:
 
 
 @pytest.fixture(scope="session")
-def demo(tmp_path_factory, spawn) -> tuple[Path, Finished]:
-    """`hm-sfm demo OUT`: OUT and what was printed."""
-    out = tmp_path_factory.mktemp("demo") / "out"
-    return out, spawn("demo", out)
+def wheel(tmp_path_factory) -> Path:
+    """The wheel of this tree."""
+    return build_wheel(tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="session")
+def installed(wheel, tmp_path_factory) -> Path:
+    """bin/ of an environment that holds the wheel and its core dependencies."""
+    return install_alone(wheel, tmp_path_factory.mktemp("installed"))
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory, installed) -> tuple[Path, Finished]:
+    """`hm-sfm demo OUT` as installed from a wheel, outside of the repository: OUT and what was printed."""
+    folder = tmp_path_factory.mktemp("demo")
+    outside = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    return folder / "out", finish([installed / "hm-sfm", "demo", folder / "out"], cwd=folder, env=outside)
 
 
 @pytest.fixture(scope="session")

@@ -24,7 +24,7 @@ from hm_sfm.network.device import autocast
 from hm_sfm.network.fine import make_fine_map
 from hm_sfm.network.homonet import HomoNet
 from hm_sfm.photos.images import prepare_image, read_ref
-from hm_sfm.training.loop import TrainConfig, run_fingerprint
+from hm_sfm.training.config import TrainConfig, run_fingerprint
 from hm_sfm.training.losses import DENSE_RADIUS
 from hm_sfm.training.mixture import MixedPairs, collate_pairs
 from hm_sfm.training.multiview import VALIDATION_SCENES, PhotoPair, PhotoPairs, read_photo_pairs

@@ -19,7 +19,7 @@ from hm_sfm.colmap.rigs import assign_cameras, read_rigs
 from hm_sfm.config import parse_config
 from hm_sfm.errors import InputError
 from hm_sfm.report.diagnosis import ADVICE, Cause
-from hm_sfm.training.loop import TrainConfig, check_config
+from hm_sfm.training.config import TrainConfig, check_config
 from hm_sfm.training.multiview import VALIDATION_SCENES
 
 ROOT = Path(__file__).parents[2]

@@ -10,7 +10,7 @@ import torch
 from hm_sfm.config import NetworkConfig
 from hm_sfm.network.backbone import XFeatTrunk
 from hm_sfm.training import loop
-from hm_sfm.training.loop import TrainConfig
+from hm_sfm.training.config import TrainConfig
 
 
 def make_photo(width: int, height: int, seed: int = 0) -> np.ndarray:

@@ -32,9 +32,10 @@ from hm_sfm.network.aspan import (
 from hm_sfm.network.checkpoints import load_weights
 from hm_sfm.network.coarse import AspanCoarse
 from hm_sfm.network.homonet import HomoNet
-from hm_sfm.training import loop
-from hm_sfm.training.loop import TrainConfig, train
+from hm_sfm.training.config import TrainConfig, check_config
+from hm_sfm.training.loop import train
 from hm_sfm.training.losses import CORNER_WEIGHT, FLOW_WEIGHT, SCALE_WEIGHT, measure_coarse_loss, measure_flow_loss
+from hm_sfm.training.state import start_network
 from hm_sfm.training.supervision import CoarseSupervision
 
 
@@ -354,7 +355,7 @@ def test_the_papers_networks_run(name, window, radius):
 
 def test_the_short_training_is_one_of_the_coarse_stage_on_rendered_scenes():
     config = load_config(Path("configs/train_aspan.yaml"), cls=TrainConfig)
-    loop.check_config(config)
+    check_config(config)
     assert config.network == dataclasses.replace(NetworkConfig(), coarse="aspan")
     assert config.stage == "coarse" and config.rendered_share == 1 and Path(config.start_from).exists()
 
@@ -391,7 +392,7 @@ def test_of_a_loftr_checkpoint_the_backbone_alone_is_taken(tmp_path):
     path = tmp_path / "loftr.ckpt"
     torch.save({"state_dict": state}, path)
     net = HomoNet(network)
-    loop.start_network(net, path)
+    start_network(net, path)
     assert all(torch.equal(value, source[name]) for name, value in net.backbone.state_dict().items())
     with pytest.raises(WeightsError, match="loftr.ckpt has no coarse stage for network.coarse aspan"):
         load_weights(str(path), network)

@@ -16,7 +16,7 @@ from hm_sfm.config import (
     parse_config,
 )
 from hm_sfm.errors import ConfigError
-from hm_sfm.training.loop import TrainConfig
+from hm_sfm.training.config import TrainConfig
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from hm_sfm.errors import MissingPackageError
 from hm_sfm.training.curves import draw_curves, read_columns, smooth
-from hm_sfm.training.loop import append_row
+from hm_sfm.training.log import append_row
 
 
 @pytest.fixture

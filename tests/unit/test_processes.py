@@ -13,7 +13,9 @@ from torch.multiprocessing import set_start_method, spawn
 
 from hm_sfm.errors import ConfigError, HmSfmError
 from hm_sfm.training import loop
-from hm_sfm.training.loop import TrainConfig, train
+from hm_sfm.training.batches import iterate_batches
+from hm_sfm.training.config import TrainConfig
+from hm_sfm.training.loop import train
 from hm_sfm.training.processes import Processes, find_processes
 
 PROCESSES = 2
@@ -149,7 +151,7 @@ def test_a_process_gets_its_share_of_every_step():
         (1, 0, [[8, 9, 10, 11], [12, 13, 14, 15], [16, 17, 18, 19]]),
         (2, 1, [[10, 11], [14, 15], [18, 19]]),
     ):
-        batches = loop.iterate_batches(pairs, 4, 2, Processes(rank, count, rank))
+        batches = iterate_batches(pairs, 4, 2, Processes(rank, count, rank))
         assert [batch["index"].tolist() for batch in batches] == expected
 
 

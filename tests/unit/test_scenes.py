@@ -7,24 +7,10 @@ import torch
 
 from hm_sfm.network.backbone import LightBackbone
 from hm_sfm.synthetic.textures import make_texture
+from hm_sfm.training.facet_views import measure_depth, plane_homography, relate_views, render_facets
+from hm_sfm.training.facets import Facet, Texture, make_board, make_box, make_relief
 from hm_sfm.training.photos import POINTS, SURFACES
-from hm_sfm.training.scenes import (
-    Facet,
-    RenderedScenes,
-    Texture,
-    ViewRange,
-    draw_cameras,
-    draw_lights,
-    draw_scene,
-    find_nearest,
-    make_board,
-    make_box,
-    make_relief,
-    plane_homography,
-    relate_views,
-    render_facets,
-    turn,
-)
+from hm_sfm.training.scenes import RenderedScenes, ViewRange, draw_cameras, draw_lights, draw_scene, make_rotation
 from hm_sfm.training.supervision import draw_patches
 from hm_sfm.types import PinholeView
 
@@ -54,16 +40,16 @@ def make_facet(origin, edge_u, edge_v, photo=None, **more):
 
 
 def make_second_view(yaw_deg=8, pitch_deg=-3, roll_deg=5, shift=(-0.4, 0.1, 0.2)):
-    return PinholeView(K, SIZE_WH, np.column_stack([turn(yaw_deg, pitch_deg, roll_deg), shift]))
+    return PinholeView(K, SIZE_WH, np.column_stack([make_rotation(yaw_deg, pitch_deg, roll_deg), shift]))
 
 
 def relate(facets, view_a, view_b):
     views = view_a, view_b
-    return relate_views(facets, views, [find_nearest(facets, view) for view in views])
+    return relate_views(views, [measure_depth(facets, view) for view in views])
 
 
 def render(facets, view=VIEW, light=DARK):
-    return render_facets(find_nearest(facets, view), view, light)
+    return render_facets(measure_depth(facets, view), view, light)
 
 
 def draw_test_scene(photos, seed):
@@ -134,7 +120,7 @@ def test_what_hides_behind_a_board_has_no_partner():
 def test_the_other_side_of_a_board_is_no_partner():
     board = make_facet((-1, -1, 3), (2, 0, 0), (0, 2, 0))
     behind = PinholeView(K, SIZE_WH, np.column_stack([np.diag([-1.0, 1, -1]), [0, 0, 6]]))
-    assert (find_nearest((board,), behind).index == 0).sum() > 1000
+    assert (measure_depth((board,), behind).index == 0).sum() > 1000
     assert (relate((board,), VIEW, behind)[1] == -1).all()
     assert (relate((board,), VIEW, VIEW)[1] == 0).sum() > 1000
 
@@ -142,7 +128,7 @@ def test_the_other_side_of_a_board_is_no_partner():
 def test_facets_behind_the_camera_and_edge_on_are_not_seen():
     behind = make_facet((-1, -1, -3), (2, 0, 0), (0, 2, 0))
     edge_on = make_facet((0, -1, 2), (0, 2, 0), (0, 0, 2))
-    shown = find_nearest((behind, edge_on), VIEW)
+    shown = measure_depth((behind, edge_on), VIEW)
     assert (shown.index == -1).all() and (shown.inverse_depth == 0).all()
     b_from_a, surface = relate((behind, edge_on), VIEW, make_second_view())
     assert np.isfinite(b_from_a).all() and (surface == -1).all()
@@ -182,8 +168,8 @@ def test_repeated_photos_are_mirrored():
 
 def test_far_textures_do_not_alias():
     checker = ((np.indices((300, 300)).sum(axis=0) % 2) * 200 + 20).astype(np.uint8)
-    far = make_board(checker, np.array([0, 0, 3.0]), turn(50, 0, 10), 2.5, focal_px=90.0)
-    shown = find_nearest((far,), VIEW).index == 0
+    far = make_board(checker, np.array([0, 0, 3.0]), make_rotation(50, 0, 10), 2.5, focal_px=90.0)
+    shown = measure_depth((far,), VIEW).index == 0
     inside = cv2.erode(shown.astype(np.uint8), np.ones((5, 5))) > 0
     assert inside.sum() > 1000
     assert render((far,))[inside].std() < 8
@@ -236,7 +222,7 @@ def test_views_of_a_scene_agree_where_they_show_the_same_surface(photos):
 
 def test_the_faces_of_a_box_look_outwards_and_close_it(photos):
     centre = np.array([0.3, -0.2, 4.0])
-    faces = make_box([photos[0]] * 6, centre, turn(30, -20, 5), np.array([0.5, 0.8, 1.2]), 100.0)
+    faces = make_box([photos[0]] * 6, centre, make_rotation(30, -20, 5), np.array([0.5, 0.8, 1.2]), 100.0)
     assert all(face.normal @ (face.corners.mean(axis=0) - centre) > 0 for face in faces)
     corners = np.concatenate([face.corners for face in faces])
     assert len(np.unique(corners.round(9), axis=0)) == 8
@@ -246,7 +232,9 @@ def test_the_faces_of_a_box_look_outwards_and_close_it(photos):
 
 
 def test_a_relief_is_one_surface_under_one_photo(photos):
-    facets = make_relief(photos[0], np.random.default_rng(0), np.array([0, 0, 5.0]), turn(10, 5, 0), 4.0, 100.0)
+    facets = make_relief(
+        photos[0], np.random.default_rng(0), np.array([0, 0, 5.0]), make_rotation(10, 5, 0), 4.0, 100.0
+    )
     texels = {}
     for facet, (u, v) in itertools.product(facets, ((0, 0), (1, 0), (0, 1))):
         vertex = tuple((facet.origin + u * facet.edge_u + v * facet.edge_v).round(9))
@@ -266,7 +254,7 @@ def test_scenes_have_depth_and_fit_the_format(photos):
     for seed in range(12):
         facets, views = draw_test_scene(photos, seed)
         counts.append(len(facets))
-        shown = find_nearest(facets, views[0])
+        shown = measure_depth(facets, views[0])
         seen = shown.inverse_depth[shown.index >= 0]
         ranges.append(np.percentile(seen, 95) / np.percentile(seen, 5))
     assert max(counts) <= SURFACES and min(counts) >= 2

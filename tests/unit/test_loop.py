@@ -1,35 +1,31 @@
-"""Training: pairs made of photos, and a loop that can be interrupted at any step."""
+"""The training loop, which can be interrupted at any step."""
 
 import csv
 import dataclasses
 import re
 import sys
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import h5py
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import Dataset, default_collate
 
 from hm_sfm.config import NetworkConfig, load_config
 from hm_sfm.errors import ConfigError, HmSfmError, InputError, WeightsError
 from hm_sfm.network.checkpoints import load_weights
 from hm_sfm.training import loop
+from hm_sfm.training.config import MegaDepthSource, MultiviewSource, Stage, TrainConfig
 from hm_sfm.training.curves import draw_curves
-from hm_sfm.training.loop import MegaDepthSource, MultiviewSource, TrainConfig, learning_rate_at, train
-from hm_sfm.training.mixture import MixedPairs, collate_pairs
+from hm_sfm.training.loop import learning_rate_at, train
+from hm_sfm.training.mixture import collate_pairs
 from hm_sfm.training.multiview import VALIDATION_SCENES
 from hm_sfm.training.objectives import measure_objective
 from hm_sfm.training.photos import (
     WarpedPhotos,
     WarpRange,
-    disturb_view,
-    draw_views,
-    load_photos,
-    render_view,
-    split_photos,
 )
 from hm_sfm.training.processes import Processes
 
@@ -37,190 +33,6 @@ from hm_sfm.training.processes import Processes
 def make_photo(width: int, height: int, seed: int = 0) -> np.ndarray:
     noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=(height, width)), (0, 0), 2.5)
     return np.clip(128 + 40 * noise / noise.std(), 0, 255).astype(np.uint8)
-
-
-# Pairs
-
-
-def wave(xy: np.ndarray) -> np.ndarray:
-    """A smooth image that is known everywhere: (..., 2) px -> (...)."""
-    x, y = xy[..., 0], xy[..., 1]
-    return 128 + 50 * np.sin(x / 13 + y / 31) + 40 * np.cos(y / 11 - x / 23) + 20 * np.sin((x + y) / 9)
-
-
-def make_pixel_centres(width: int, height: int) -> np.ndarray:
-    return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
-
-
-def map_points(homography: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    mapped = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1) @ homography.T
-    return mapped[..., :2] / mapped[..., 2:]
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_views_show_the_photo_where_their_homography_says(seed):
-    """To a tenth of a pixel: the wave changes by up to 9 grey values a pixel of the photo."""
-    width, height, size = 400, 300, 128
-    photo = np.round(wave(make_pixel_centres(width, height))).astype(np.uint8)
-    rng = np.random.default_rng(seed)
-    for view_from_photo in draw_views(photo.shape, (size, size), WarpRange(), rng):
-        view = render_view(photo, view_from_photo, (size, size))
-        source = map_points(np.linalg.inv(view_from_photo), make_pixel_centres(size, size))
-        inside = np.all((source > 4) & (source < (width - 4, height - 4)), axis=-1)
-        error = (view - wave(source))[inside]
-        slope = np.abs(np.gradient(view)[0])[inside].mean()
-        assert inside.mean() > 0.2
-        # A shift of half a pixel would show as a mean error of about half the slope.
-        assert np.abs(error).mean() < 0.15 * slope + 1.0
-        shift = fit_shift(view, error, inside)
-        assert np.abs(shift).max() < 0.1
-
-
-def fit_shift(view: np.ndarray, error: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """(2,) px: the shift of the view that explains its error best."""
-    gradient_y, gradient_x = np.gradient(view)
-    slopes = np.stack([gradient_x[inside], gradient_y[inside]], axis=1)
-    return np.linalg.lstsq(slopes, error, rcond=None)[0]
-
-
-def test_the_homography_between_views_is_that_of_the_item():
-    """What view A shows at a point, view B shows where b_from_a puts it."""
-    photo = np.round(wave(make_pixel_centres(400, 300))).astype(np.uint8)
-    size, warp = 128, WarpRange()
-    pairs = WarpedPhotos([photo], (size, size), seed=3, count=4, warp=warp)
-    for index in range(4):
-        item = pairs[index]
-        rng = np.random.default_rng([3, index])
-        rng.integers(1)
-        a_from_photo, b_from_photo = draw_views(photo.shape, (size, size), warp, rng)
-        points = make_pixel_centres(size, size)[8:-8:16, 8:-8:16]
-        in_photo = map_points(np.linalg.inv(a_from_photo), points)
-        np.testing.assert_allclose(
-            map_points(item["b_from_a"][0].astype(float), points), map_points(b_from_photo, in_photo), atol=0.05
-        )
-        assert item["images"].shape == (2, size, size) and item["images"].dtype == np.uint8
-        assert item["b_from_a"].dtype == np.float32 and item["b_from_a"][0, 2, 2] == 1
-
-
-def test_items_depend_on_seed_and_index_alone():
-    photos = [make_photo(200, 160, seed) for seed in range(3)]
-    first, again, other = (WarpedPhotos(photos, (64, 64), seed, 10, WarpRange()) for seed in (1, 1, 2))
-    assert len(first) == 10
-    # Whatever was asked for before does not matter.
-    assert len(again[0]["images"]) == len(again[5]["images"]) == 2
-    for key in ("images", "b_from_a"):
-        assert np.array_equal(first[7][key], again[7][key])
-        assert not np.array_equal(first[7][key], first[6][key])
-        assert not np.array_equal(first[7][key], other[7][key])
-
-
-def test_views_are_no_farther_apart_than_asked():
-    warp = WarpRange(scale=1.5, rotation_deg=20.0, perspective=0.0)
-    scales, turns = [], []
-    for seed in range(200):
-        a_from_photo, b_from_photo = draw_views((300, 400), (128, 128), warp, np.random.default_rng(seed))
-        linear = (b_from_photo @ np.linalg.inv(a_from_photo))[:2, :2]
-        scales.append(np.sqrt(np.linalg.det(linear)))
-        turns.append(np.degrees(np.arctan2(linear[1, 0], linear[0, 0])))
-    assert 1 / 1.5 - 1e-6 <= min(scales) < 0.75 and 1.35 < max(scales) <= 1.5 + 1e-6
-    assert -20 - 1e-6 <= min(turns) < -15 and 15 < max(turns) <= 20 + 1e-6
-
-
-def test_disturbing_a_view_keeps_its_geometry():
-    view = make_photo(96, 96).astype(np.float32)
-    for seed in range(20):
-        disturbed = disturb_view(view, np.random.default_rng(seed))
-        assert disturbed.shape == view.shape and disturbed.dtype == np.uint8
-        spectrum = np.fft.fft2(view - view.mean()) * np.conj(np.fft.fft2(disturbed - disturbed.mean()))
-        peak = np.unravel_index(np.fft.ifft2(spectrum).real.argmax(), view.shape)
-        assert peak == (0, 0)
-
-
-# Photos
-
-
-def test_photos_are_read_grey_reduced_and_in_order(tmp_path, caplog):
-    (tmp_path / "b").mkdir()
-    cv2.imwrite(str(tmp_path / "b" / "1.JPG"), make_photo(1280, 900))
-    cv2.imwrite(str(tmp_path / "a.png"), np.stack([make_photo(200, 300)] * 3, axis=-1))
-    cv2.imwrite(str(tmp_path / "small.png"), make_photo(127, 300))
-    (tmp_path / "bad.png").write_bytes(b"no photo")
-    (tmp_path / "notes.txt").write_text("no photo either")
-    photos = load_photos(tmp_path)
-    assert [photo.shape for photo in photos] == [(300, 200), (450, 640)]
-    assert all(photo.dtype == np.uint8 for photo in photos)
-    assert "small.png" in caplog.text and "bad.png" in caplog.text and "notes" not in caplog.text
-
-
-def test_folders_without_photos_are_refused(tmp_path):
-    with pytest.raises(InputError, match="absent"):
-        load_photos(tmp_path / "absent")
-    with pytest.raises(InputError, match=tmp_path.name):
-        load_photos(tmp_path)
-    (tmp_path / "bad.png").write_bytes(b"no photo")
-    with pytest.raises(InputError, match="no usable training image"):
-        load_photos(tmp_path)
-    with pytest.raises(InputError, match="bad.png"):
-        load_photos(tmp_path / "bad.png")
-
-
-def test_validation_photos_are_not_trained_on():
-    photos = [np.full((1, 1), i) for i in range(40)]
-    training, validation = split_photos(photos)
-    assert sorted(int(photo[0, 0]) for photo in training + validation) == list(range(40))
-    assert [int(photo[0, 0]) for photo in validation] == [0, 15, 30]
-    training, validation = split_photos(photos[:1])
-    assert len(training) == len(validation) == 1
-
-
-# Mixtures
-
-
-class Tagged(Dataset):
-    """Items that say where they come from, with so many surfaces."""
-
-    def __init__(self, tag: float, surfaces: int = 2, count: int = 400) -> None:
-        self.tag, self.surfaces, self.count = tag, surfaces, count
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, index: int) -> dict[str, np.ndarray]:
-        b_from_a = np.full((self.surfaces, 3, 3), self.tag, np.float32)
-        return {"b_from_a": b_from_a, "tag": np.array(self.tag), "index": np.array(index)}
-
-
-def draw_tags(kinds: list[tuple[Dataset, float]], seed: int = 1) -> list[float]:
-    pairs = MixedPairs(kinds, seed)
-    return [float(pairs[i]["tag"]) for i in range(len(pairs))]
-
-
-def test_a_mixture_has_its_shares():
-    tags = draw_tags([(Tagged(0), 0.5), (Tagged(1), 0.2), (Tagged(2), 0.0), (Tagged(3), 0.3)])
-    shares = [tags.count(tag) / 400 for tag in range(4)]
-    assert shares[2] == 0
-    np.testing.assert_allclose(shares, [0.5, 0.2, 0, 0.3], atol=0.08)
-
-
-def test_a_mixture_is_drawn_by_seed_and_index():
-    kinds = [(Tagged(0), 0.5), (Tagged(1), 0.5)]
-    assert draw_tags(kinds) == draw_tags(kinds) != draw_tags(kinds, seed=2)
-    pairs = MixedPairs(kinds, 1)
-    assert len(pairs) == 400 and pairs[17]["index"] == 17
-    assert set(draw_tags([(Tagged(0), 0.0), (Tagged(1), 0.1)])) == {1}
-
-
-def test_a_batch_fills_up_the_surfaces():
-    batch = collate_pairs([Tagged(1, surfaces=2)[0], Tagged(2, surfaces=5)[1]])
-    assert batch["b_from_a"].shape == (2, 5, 3, 3) and batch["b_from_a"].dtype == torch.float32
-    assert (batch["b_from_a"][0, :2] == 1).all() and (batch["b_from_a"][1] == 2).all()
-    assert not batch["b_from_a"][0, 2:].any()
-    assert batch["index"].tolist() == [0, 1]
-    same = [Tagged(1)[0], Tagged(2)[0]]
-    assert torch.equal(collate_pairs(same)["b_from_a"], default_collate(same)["b_from_a"])
-
-
-# The loop
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
@@ -287,7 +99,7 @@ TRAINED = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", loop.STAGES)
+@pytest.mark.parametrize("stage", get_args(Stage))
 def test_a_stage_changes_all_of_its_own_parts_and_nothing_else(training, stage):
     """Of the others, not even the running statistics of batch norms."""
     training = dataclasses.replace(training, stage=stage, steps=3)
@@ -339,25 +151,6 @@ def test_real_pairs_train_both_stages_by_their_points(training, tmp_path):
         assert float(row["dense"]) == float(row["corner"]) == float(row["scale"]) == 0
     scores = read_rows(path.with_name("validation.csv"))[0]
     assert {"real_recall", "real_precision"} <= set(scores) and "rendered_recall" not in scores
-
-
-def test_megadepth_is_one_of_the_kinds_of_pairs(training, monkeypatch):
-    made = []
-
-    def make(root, scene_info, size_wh, seed, count):
-        made.append((root.name, scene_info.name, size_wh, seed, count))
-        return Tagged(7, count=count)
-
-    monkeypatch.setattr(loop, "MegaDepthPairs", make)
-    source = MegaDepthSource(root="root", scene_info="index", validation_info="held_out")
-    training = dataclasses.replace(training, megadepth=source, rendered_share=0.3, megadepth_share=0.7)
-    photos = [make_photo(160, 144)]
-    pairs = loop.make_pairs(photos, training, 5, 40, held_out=False)
-    loop.make_pairs(photos, training, 6, 8, held_out=True)
-    assert made == [("root", "index", (64, 64), 5, 40), ("root", "held_out", (64, 64), 6, 8)]
-    # 1 - 0.3 - 0.7 is not quite 0 in floating point, but no share of warped photos.
-    assert len(pairs.kinds) == 2
-    assert 15 < sum("tag" in pairs[i] for i in range(40)) < 40
 
 
 @pytest.mark.slow
@@ -527,24 +320,6 @@ def test_a_training_without_matplotlib_has_no_picture_and_says_so_once(training,
     assert [record.message for record in caplog.records if "matplotlib" in record.message] == [
         f"{path.with_name('curves.png')} is not drawn: it needs the package matplotlib, pip install matplotlib"
     ]
-
-
-def test_rows_that_are_cut_short_or_too_late_are_dropped(tmp_path):
-    path = tmp_path / "log.csv"
-    path.write_text("step,loss\n1,0.5\n2,0.25\n3,0.125\n10,0.5\n")
-    loop.drop_rows_after(path, 2)
-    assert path.read_text() == "step,loss\n1,0.5\n2,0.25\n"
-    # The machine went down in the middle of "25,0.75": neither its beginning nor one without an end is a row.
-    for rest in ("2", "2,0.7"):
-        path.write_text("step,loss\n1,0.5\n" + rest)
-        loop.drop_rows_after(path, 20)
-        assert path.read_text() == "step,loss\n1,0.5\n"
-    path.write_text("")
-    loop.drop_rows_after(path, 20)
-    loop.append_row(path, {"step": 1, "loss": 0.5})
-    assert path.read_text().split() == ["step,loss", "1,0.5"]
-    loop.drop_rows_after(tmp_path / "absent.csv", 1)
-    assert not (tmp_path / "absent.csv").exists()
 
 
 def test_the_learning_rate_warms_up_and_falls():

@@ -200,7 +200,7 @@ class Config:
 RENAMED: dict[type, dict[str, str]] = {
     MatchingConfig: {
         "retry_turned": "matching.try_hypotheses",
-        "coarse_threshold": "matching.min_cosine or matching.min_confidence",
+        "coarse_threshold": "matching.min_cosine (coarse stage cosine) or matching.min_confidence (attention, aspan)",
     },
     KeypointConfig: {
         "carry_score": "keypoints.propagation_min_score",

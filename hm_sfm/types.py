@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.geometry.nearest import find_nearest
 
 
@@ -100,7 +101,7 @@ class PatchMatches:
         )
 
     def warp(self, xy0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Carry points of image 0 into image 1, each by the patch whose centre is nearest.
+        """Transfer points of image 0 into image 1, each by the patch whose centre is nearest.
 
         xy0: (N, 2) px. Returns xy1 (N, 2) float32 px, NaN where not valid, and valid (N,) bool: a patch centre lies
         within patch_radius_px.
@@ -128,13 +129,6 @@ class PatchMatches:
         # A centre may lie at the edge of its pixel: the square's farthest corner is sqrt(2) (radius + 1/2) away.
         index, _ = find_nearest(xy0, self.xy0, 1.5 * (radius + 0.5))
         return xy0, apply_homographies(self.homography[index], xy0)
-
-
-def apply_homographies(homography: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Map point i by homography i: (N, 3, 3) and (N, 2) px -> (N, 2) float32 px (computed in float64)."""
-    homography = homography.astype(np.float64)
-    mapped = np.einsum("nij,nj->ni", homography[:, :, :2], xy) + homography[:, :, 2]
-    return (mapped[:, :2] / mapped[:, 2:]).astype(np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)

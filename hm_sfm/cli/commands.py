@@ -187,8 +187,8 @@ def run_evaluate(options: argparse.Namespace) -> int:
 
 
 def run_train(options: argparse.Namespace) -> int:
-    from hm_sfm.training.loop import train
     from hm_sfm.training.config import TrainConfig
+    from hm_sfm.training.loop import train
     from hm_sfm.training.processes import find_processes
 
     weights = train(load_config(options.config, tuple(options.settings), TrainConfig), options.resume, options.quiet)

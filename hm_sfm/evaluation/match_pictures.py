@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 
 from hm_sfm.evaluation.relative_poses import PosePair
+from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.photos.images import prepare_image, read_ref
 from hm_sfm.report.drawn_matches import draw_matches, draw_photo_matches
-from hm_sfm.types import PatchMatches, apply_homographies
+from hm_sfm.types import PatchMatches
 
 LONG_EDGE_PX = 1024
 """Of each photo in a picture."""

@@ -8,8 +8,9 @@ import numpy as np
 from torch.utils.data import Dataset
 from tqdm import tqdm
 
+from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.types import PatchMatches, apply_homographies
+from hm_sfm.types import PatchMatches
 
 ERROR_LIMITS_PX = (1, 3, 5)
 CORRECT_LIMITS_PX = (3, 1)

@@ -1,6 +1,9 @@
-"""Neighbours among points of the plane, by a grid of buckets; vectorised, no tree, no loop over points."""
+"""Neighbours among points of the plane."""
+
+import itertools
 
 import numpy as np
+from scipy.spatial import KDTree
 
 
 def find_pairs_within(
@@ -8,40 +11,25 @@ def find_pairs_within(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """All (query, point) pairs at most `radius` apart.
 
-    queries: (Q, 2), points: (N, 2), any float dtype, same unit as radius > 0. Returns query_index (P,) int64 ascending,
-    point_index (P,) int64, distance (P,) float64. Meant for radii that hold few points.
+    queries: (Q, 2), points: (N, 2), any float dtype, same unit as radius > 0; points are finite. Returns query_index
+    (P,) int64 ascending, point_index (P,) int64, distance (P,) float64. The points of a query come row by row of
+    squares as large as the radius, by index within a square: sums over them are always the same to the last digit.
     """
-    none = np.zeros(0, np.int64)
     if len(queries) == 0 or len(points) == 0:
-        return none, none, np.zeros(0)
-    origin = points.min(axis=0).astype(np.float64)
-    bucket = np.floor((points - origin) / radius).astype(np.int64) + 1
-    row_length = int(bucket[:, 0].max()) + 3
-    key = bucket[:, 1] * row_length + bucket[:, 0]
-    order = np.argsort(key, kind="stable")
-    sorted_key = key[order]
-    # Queries far outside would wrap into other rows: they are moved to a bucket that has no neighbours.
-    target = np.floor((queries - origin) / radius) + 1
-    outside = ~np.all((target >= -1) & (target <= bucket.max(axis=0) + 1), axis=1)
-    target = np.where(outside[:, None], -3, target).astype(np.int64)
-
-    first, count = [], []
-    for step in (-1, 0, 1):
-        row = (target[:, 1] + step) * row_length + target[:, 0]
-        left = np.where(target[:, 0] < 1, row - target[:, 0] + 1, row - 1)
-        right = np.minimum(row + 1, (target[:, 1] + step) * row_length + row_length - 1)
-        low = np.searchsorted(sorted_key, left)
-        first.append(low)
-        count.append(np.maximum(np.searchsorted(sorted_key, right, side="right") - low, 0))
-    counts = np.stack(count, axis=1).ravel()
-    starts = np.stack(first, axis=1).ravel()
-    query_index = np.repeat(np.arange(len(queries)), counts.reshape(-1, 3).sum(axis=1))
-    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    point_index = order[np.repeat(starts, counts) + within]
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
+    lowest, highest = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    # The tree takes no query that is not finite, or so far away that the square of its distance overflows.
+    inside = np.all((queries >= lowest - 2 * radius) & (queries <= highest + 2 * radius), axis=1).nonzero()[0]
+    # A bit farther, because the tree rounds distances otherwise.
+    near = KDTree(points).query_ball_point(queries[inside], radius * (1 + 1e-9))
+    query_index = np.repeat(inside, np.fromiter(map(len, near), np.int64, len(near)))
+    point_index = np.fromiter(itertools.chain.from_iterable(near), np.int64, len(query_index))
     offset = queries[query_index].astype(np.float64) - points[point_index]
     distance = np.hypot(offset[:, 0], offset[:, 1])
-    near = distance <= radius
-    return query_index[near], point_index[near], distance[near]
+    column, row = np.floor((points - lowest) / radius).T
+    order = np.lexsort((point_index, column[point_index], row[point_index], query_index))
+    order = order[distance[order] <= radius]
+    return query_index[order], point_index[order], distance[order]
 
 
 def find_nearest(queries: np.ndarray, points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:

@@ -15,11 +15,11 @@ import numpy as np
 from tqdm import tqdm
 
 from hm_sfm.errors import ConfigError, StaleResultError
+from hm_sfm.geometry.homographies import differentiate
 from hm_sfm.io.batches import store_in_batches
 from hm_sfm.keypoints.graph import KeypointGraph, Photo, TrackEdges
 from hm_sfm.keypoints.propagation import choose_good
 from hm_sfm.keypoints.refined_patches import PatchRefiner, Placement
-from hm_sfm.keypoints.transfer import differentiate
 from hm_sfm.matching.encoder import Encoder
 from hm_sfm.matching.order import order_pairs
 from hm_sfm.matching.store import MatchStore

@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hm_sfm.config import KeypointConfig
+from hm_sfm.geometry.homographies import apply_homographies, differentiate
 from hm_sfm.geometry.nearest import find_nearest, find_pairs_within
 from hm_sfm.keypoints.adjustment import weigh_scores
 from hm_sfm.keypoints.graph import Photo, PropagatedPoints
 from hm_sfm.keypoints.seeds import thin_points
-from hm_sfm.types import PairMatches, apply_homographies
+from hm_sfm.types import PairMatches
 
 AGREEMENT_PX = 0.5
 """Distance from the mean at which what a patch says of a point counts half."""
@@ -101,11 +102,3 @@ def mean_in_groups(values: np.ndarray, group: np.ndarray, weight: np.ndarray, co
     total = np.bincount(group, weight, count)
     sums = [np.bincount(group, weight * column, count) for column in values.T]
     return np.stack(sums, axis=1) / np.maximum(total, 1e-12)[:, None]
-
-
-def differentiate(homography: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """(N, 2, 2): the derivative of homography i (N, 3, 3) at point i (N, 2)."""
-    ones = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    x, y, w = np.einsum("nij,nj->in", homography, ones)
-    top = homography[:, :2, :2] * w[:, None, None] - np.stack([x, y], 1)[:, :, None] * homography[:, 2:, :2]
-    return top / w[:, None, None] ** 2

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
+from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.photos.images import PreparedImage
-from hm_sfm.types import apply_homographies
 
 WORST_PX = 5.0
 """Errors from here on are red."""

@@ -10,11 +10,12 @@ from hm_sfm.colmap.cameras import make_cameras
 from hm_sfm.colmap.verification import is_convincing, verify_pair
 from hm_sfm.config import CameraConfig, VerificationConfig
 from hm_sfm.errors import InputError
+from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.photos.images import PreparedImage, prepare_image, read_ref
 from hm_sfm.report.drawn_matches import GAP_PX, WORST_PX, draw_photo_matches, make_grey, place_points
-from hm_sfm.types import PatchMatches, apply_homographies
+from hm_sfm.types import PatchMatches
 
 LONG_EDGE_PX = 800
 """Of each photo in the picture."""

@@ -37,8 +37,8 @@ from hm_sfm.config import load_config
 from hm_sfm.errors import ConfigError, HmSfmError
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.network.checkpoints import digest_weights, load_weights
-from hm_sfm.training.loop import train
 from hm_sfm.training.config import TrainConfig
+from hm_sfm.training.loop import train
 
 SUPERVISIONS = {"semi-dense": "centre", "+ dense": "dense", "+ suppressed": "suppressed"}
 """Row -> TrainConfig.supervise."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from hm_sfm.config import ImageConfig, MatchingConfig, fingerprint
 from hm_sfm.evaluation.relative_poses import PosePair, read_strecha_pairs, score_poses
+from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.io.atomic import replace_file, write_json
 from hm_sfm.matching.cells import choose_threshold
 from hm_sfm.matching.encoder import pad_image
@@ -31,7 +32,6 @@ from hm_sfm.training.multiview import VALIDATION_SCENES, PhotoPair, PhotoPairs, 
 from hm_sfm.training.objectives import score_network
 from hm_sfm.training.photos import WarpedPhotos, load_photos, split_photos
 from hm_sfm.training.scenes import RenderedScenes
-from hm_sfm.types import apply_homographies
 
 SIZE_WH = (640, 480)
 PAIRS = 48

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from hm_sfm.config import KeypointConfig
+from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.keypoints.graph import FlatGraph, KeypointGraph, Photo
 from hm_sfm.keypoints.persistence import collect_keypoints, group_matches, persist_keypoints
 from hm_sfm.keypoints.propagation import MIN_PROPAGATING, choose_good, propagate_keypoints
 from hm_sfm.keypoints.settled_tracks import prune_edges
-from hm_sfm.types import ImagePair, PairMatches, apply_homographies
+from hm_sfm.types import ImagePair, PairMatches
 
 CONFIG = KeypointConfig()
 SIZE_WH = (128, 96)

@@ -10,9 +10,10 @@ import pytest
 from hm_sfm.cli import main
 from hm_sfm.errors import InputError
 from hm_sfm.evaluation.points import PATCH_POINTS, measure_matches, measure_points, score_points
+from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.training.photos import split_photos
 from hm_sfm.training.validation import make_validation_pairs
-from hm_sfm.types import PatchMatches, apply_homographies
+from hm_sfm.types import PatchMatches
 
 WIDTH, HEIGHT = 96, 64
 SHIFTED = np.array([[1, 0, 7.5], [0, 1, -3.25], [0, 0, 1]])

@@ -9,17 +9,16 @@ import pytest
 from hm_sfm.config import ImageConfig, KeypointConfig, MatchingConfig
 from hm_sfm.errors import ConfigError
 from hm_sfm.geometry.frames import homography_to_pixel_index
+from hm_sfm.geometry.homographies import apply_homographies, differentiate
 from hm_sfm.keypoints import refinement
 from hm_sfm.keypoints.graph import KeypointGraph, Photo, PropagatedPoints, TrackEdges
 from hm_sfm.keypoints.persistence import collect_keypoints
 from hm_sfm.keypoints.refined_patches import fit_hypotheses
 from hm_sfm.keypoints.refinement import KeypointRefiner
-from hm_sfm.keypoints.transfer import differentiate
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.store import MatchStore, digest_image
 from hm_sfm.network.fine import ExpectationHead
 from hm_sfm.photos.images import prepare_image, read_ref
-from hm_sfm.types import apply_homographies
 
 SIZE_WH = (768, 576)
 PX_SCALE = 3.0

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hm_sfm.keypoints.transfer import differentiate
+from hm_sfm.geometry.homographies import differentiate
 
 
 def test_the_derivative_of_a_homography():

@@ -1,4 +1,4 @@
-"""Neighbours by buckets against brute force."""
+"""Neighbours against brute force, and in the order that sums depend on."""
 
 import numpy as np
 import pytest
@@ -28,6 +28,15 @@ def test_pairs_within_equal_brute_force(queries, points, radius):
     assert np.array_equal(query[order], expected_query)
     assert np.array_equal(point[order], expected_point)
     np.testing.assert_allclose(distance[order], expected_distance)
+
+
+def test_the_points_of_a_query_come_row_by_row():
+    x, y = np.meshgrid(np.arange(4.0), np.arange(4.0))
+    points = np.stack([x.ravel(), y.ravel()], axis=1)[::-1]
+    query, point, _ = find_pairs_within(np.array([[1.5, 1.5], [0.0, 0.0]]), points, 2.0)
+    # Squares of 2 x 2 points: that of (0, 0) holds the last ones, each square by index.
+    assert query.tolist() == [0] * 12 + [1] * 6
+    assert point[:4].tolist() == [10, 11, 14, 8] and point[12:].tolist() == [10, 11, 14, 15, 13, 7]
 
 
 @given(queries=points, points=points, radius=radii)

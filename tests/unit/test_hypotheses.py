@@ -10,6 +10,7 @@ import pytest
 
 from hm_sfm.config import ImageConfig, MatchingConfig
 from hm_sfm.geometry.frames import pixel_index_from_px, rotation_matrix
+from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.matching.feature_cache import cache_features, match_pair
 from hm_sfm.matching.hypotheses import (
     FEW_MATCHES,
@@ -27,7 +28,7 @@ from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.photos.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
 from hm_sfm.photos.images import CV_ROTATIONS, prepare_array, prepare_image, read_ref, read_rgb
 from hm_sfm.synthetic.textures import MATERIALS, make_texture
-from hm_sfm.types import ImagePair, PatchMatches, apply_homographies
+from hm_sfm.types import ImagePair, PatchMatches
 
 SHIFT = np.array([[1, 0, -13], [0, 1, -9], [0, 0, 1.0]])
 """Px of `photo` -> px of `other`."""

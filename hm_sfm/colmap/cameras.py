@@ -71,7 +71,7 @@ def make_cameras(images: Sequence[ImageRef], config: CameraConfig) -> Cameras:
 
     groups: dict[Hashable, list[int]] = {}
     for index, key in enumerate(_camera_keys(images, exif, config.mode, known=bool(params))):
-        groups.setdefault(("rig", *taken_by[index]) if taken_by[index] else key, []).append(index)
+        groups.setdefault(("rig", taken_by[index]) if taken_by[index] else key, []).append(index)
 
     cameras = []
     camera_index = [0] * len(images)
@@ -91,7 +91,7 @@ def make_cameras(images: Sequence[ImageRef], config: CameraConfig) -> Cameras:
         if params or in_rig:
             if in_rig:
                 camera.model = in_rig.model
-            camera.params = in_rig.params if in_rig else params
+            camera.params = list(in_rig.params) if in_rig else params
             camera.has_prior_focal_length = True
             if camera.has_bogus_params(0.0, math.inf, math.inf):
                 raise ConfigError(
@@ -150,7 +150,7 @@ def _take_cameras(
 
 def _camera_keys(images: Sequence[ImageRef], exif: Sequence[_ExifFocal], mode: str, known: bool) -> list[Hashable]:
     """Per image, what it must have in common with another to share its camera."""
-    folders = [PurePosixPath(image.name).parent for image in images]
+    folders: list[Hashable] = [PurePosixPath(image.name).parent for image in images]
     if mode == "single":
         return [None] * len(images)
     if mode == "per-folder":

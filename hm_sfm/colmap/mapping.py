@@ -61,7 +61,7 @@ class MappingTask:
     error in photos of 1000 px, and as much more as photos are larger."""
     fix_intrinsics: bool = False
     """Keep all cameras as the database has them."""
-    on_image: Callable[[], None] | None = None
+    on_image: Callable[[], object] | None = None
     """Called once per registered image, of a rig once per frame."""
 
 
@@ -325,10 +325,11 @@ def _run_triangulator(
     return [model]
 
 
-def _report_images(models: Sequence[pycolmap.Reconstruction], on_image: Callable[[], None] | None) -> None:
+def _report_images(models: Sequence[pycolmap.Reconstruction], on_image: Callable[[], object] | None) -> None:
     """Call on_image for each registered image."""
-    for _ in range(sum(model.num_reg_images() for model in models) if on_image else 0):
-        on_image()
+    if on_image:
+        for _ in range(sum(model.num_reg_images() for model in models)):
+            on_image()
 
 
 def _adjust(model: pycolmap.Reconstruction, options: pycolmap.IncrementalPipelineOptions) -> None:

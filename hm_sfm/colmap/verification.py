@@ -94,14 +94,15 @@ def verify_pair(
     kinds = pycolmap.TwoViewGeometryConfiguration
     kind = kinds(geometry.config)
     inliers = rejected
-    if kind == kinds.UNCALIBRATED:
+    if kind == kinds.UNCALIBRATED and geometry.F is not None:
         inliers = _epipolar_inliers(xy0, xy1, geometry.F, max_error_px)
     elif kind in (kinds.CALIBRATED, kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):
         # As COLMAP does: a plane that dominates the pair must not cost it what stands before the plane.
         if geometry.E is not None:
-            max_error = np.mean([camera.cam_from_img_threshold(max_error_px) for camera in (camera0, camera1)])
-            inliers = _epipolar_inliers(camera0.cam_from_img(xy0), camera1.cam_from_img(xy1), geometry.E, max_error)
-        if kind != kinds.CALIBRATED:
+            max_error = float(np.mean([camera.cam_from_img_threshold(max_error_px) for camera in (camera0, camera1)]))
+            rays0, rays1 = np.asarray(camera0.cam_from_img(xy0)), np.asarray(camera1.cam_from_img(xy1))
+            inliers = _epipolar_inliers(rays0, rays1, geometry.E, max_error)
+        if kind != kinds.CALIBRATED and geometry.H is not None:
             planar = _planar_inliers(xy0, xy1, geometry.H, max_error_px)
             inliers = max(inliers, planar, key=np.count_nonzero)
     accepted = np.count_nonzero(inliers) >= max(config.min_inliers, config.min_inlier_ratio * len(matches))
@@ -148,7 +149,7 @@ def verify_pairs(
             config,
             max(px_scale[pair.name0], px_scale[pair.name1]),
         )
-        if is_convincing(np.count_nonzero(agreeing), len(confident), config):
+        if is_convincing(int(np.count_nonzero(agreeing)), len(confident), config):
             inliers = np.zeros(len(matches), dtype=bool)
             inliers[confident[agreeing]] = True
             cover0 = measure_cover(matches.xy0[inliers], size_wh[pair.name0])

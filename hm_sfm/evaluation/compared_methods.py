@@ -61,7 +61,7 @@ class ComparisonTask:
     config: Config
     digests: Mapping[str, str]
     """Image name -> digest of the photo."""
-    ground_truth: Mapping[str, PinholeView] | None
+    ground_truth: dict[str, PinholeView] | None
     """Image name -> its true camera."""
     quiet: bool = False
 

@@ -188,7 +188,9 @@ def import_hloc(task: ComparisonTask, features: Path, matches: Path) -> Method:
     paired = {name for pair in pairs for name in (pair.name0, pair.name1)}
     stored = read_features(features, [image for image in images if image.name in paired])
     keypoints_of = {keypoints.name: keypoints for keypoints in stored}
-    keypoints = [keypoints_of.get(i.name, Keypoints(i.name, np.zeros((0, 2)), [], [])) for i in images]
+    keypoints = [
+        keypoints_of.get(i.name, Keypoints(i.name, np.zeros((0, 2)), np.zeros(0), np.zeros(0))) for i in images
+    ]
     index_matches = read_matches(matches, pairs, keypoints)
 
     def build() -> dict[str, float | None]:

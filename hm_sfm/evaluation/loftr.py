@@ -10,6 +10,7 @@ from torch import Tensor
 from hm_sfm.config import ImageConfig, MatchingConfig
 from hm_sfm.errors import MissingPackageError
 from hm_sfm.matching.encoder import pad_image
+from hm_sfm.matching.interfaces import CellMatcher
 from hm_sfm.matching.patches import is_inside
 from hm_sfm.network.checkpoints import digest_weights, fit_state, read_checkpoint
 from hm_sfm.network.device import pick_device
@@ -51,7 +52,7 @@ class LoftrMatcher:
                 "LoFTR's own matches need the package kornia, which is not installed: pip install kornia"
             ) from error
         self.config, self.images = config, images
-        self.cell_matcher = None  # LoFTR is compared as it is: no rotation or scale hypotheses
+        self.cell_matcher: CellMatcher | None = None  # LoFTR is compared as it is: no rotation or scale hypotheses
         self.made_by = {
             "weights": digest_weights(str(checkpoint)),
             "kornia": kornia.__version__,
@@ -72,19 +73,20 @@ class LoftrMatcher:
         return LoftrImage(pixels, image.scaled_wh, image.stored_from_scaled)
 
     @torch.inference_mode()
-    def match_features(self, image0: LoftrImage, image1: LoftrImage) -> PatchMatches:
+    def match_features(self, features0: LoftrImage, features1: LoftrImage) -> PatchMatches:
         """Match two images; coordinates are px of the stored images, the score is LoFTR's confidence.
 
         The public checkpoints were trained on COLMAP's cameras, so that their points are in its frame, as kornia
         says, too: nothing is added.
         """
-        found = self.net({"image0": image0.pixels, "image1": image1.pixels})
-        stored0, stored1 = image0.stored_from_scaled, image1.stored_from_scaled
+        found = self.net({"image0": features0.pixels, "image1": features1.pixels})
+        stored0, stored1 = features0.stored_from_scaled, features1.stored_from_scaled
         xy0 = found["keypoints0"].double().cpu().numpy() @ stored0[:2, :2].T + stored0[:2, 2]
         xy1 = found["keypoints1"].double().cpu().numpy() @ stored1[:2, :2].T + stored1[:2, 2]
         score = found["confidence"].float().cpu().numpy()
         inside0, inside1 = (
-            is_inside(xy, image.scaled_wh, image.stored_from_scaled) for xy, image in ((xy0, image0), (xy1, image1))
+            is_inside(xy, features.scaled_wh, features.stored_from_scaled)
+            for xy, features in ((xy0, features0), (xy1, features1))
         )
         inside = np.flatnonzero(inside0 & inside1)
         best = inside[np.argsort(-score[inside], kind="stable")][: self.config.max_matches]

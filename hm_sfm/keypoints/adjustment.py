@@ -52,32 +52,35 @@ def adjust_keypoints(graph: FlatGraph, rounds: int, anchors: Anchors = NO_ANCHOR
     present positions of the others. The weights follow the scores and the residuals (iteratively reweighted least
     squares).
     """
-    weight = weigh_scores(graph.score)
     inverse = np.linalg.inv(graph.jacobian)
     xy, source, target = graph.xy, graph.source, graph.target
     moved = xy.astype(np.float64).copy()
     count = len(xy)
     ends = np.concatenate([target, source, anchors.keypoint])
-    says_at = np.bincount(ends, minlength=count)
-    for number in range(rounds + 1):
-        forward = predict_targets(graph, moved)
+    weight = weigh_scores(graph.score)
+    weight = np.concatenate([weight, weight, np.full(len(anchors.keypoint), ANCHOR_WEIGHT)])
+
+    def measure(forward: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How far off each end is, what that end is worth (both as `ends`), and the sum of the latter by keypoint."""
         residual = np.linalg.norm(forward - moved[target], axis=1)
         apart = np.linalg.norm(anchors.xy - moved[anchors.keypoint], axis=1)
-        robust = weight / (1 + (residual / ROBUST_SCALE_PX) ** 2)
-        anchored = ANCHOR_WEIGHT / (1 + (apart / ROBUST_SCALE_PX) ** 2)
-        trust = np.concatenate([robust, robust, anchored])
-        total = np.bincount(ends, trust, count) + PRIOR_WEIGHT
-        if number == rounds:
-            break
+        off = np.concatenate([residual, residual, apart])
+        trust = weight / (1 + (off / ROBUST_SCALE_PX) ** 2)
+        return off, trust, np.bincount(ends, trust, count) + PRIOR_WEIGHT
+
+    for _ in range(rounds):
+        forward = predict_targets(graph, moved)
+        _, trust, total = measure(forward)
         backward = xy[source] + np.einsum("eij,ej->ei", inverse, moved[target] - graph.predicted)
         says = np.concatenate([forward, backward, anchors.xy])
         for axis in range(2):
             mean = (np.bincount(ends, trust * says[:, axis], count) + PRIOR_WEIGHT * xy[:, axis]) / total
             # Less than a full step: two keypoints that both move to where the other one wants them would swap for ever.
             moved[:, axis] += STEP * (mean - moved[:, axis])
-    squared = trust * np.concatenate([residual, residual, apart]) ** 2
-    spread = np.bincount(ends, squared, count) + PRIOR_WEIGHT * ROBUST_SCALE_PX**2
-    return moved, np.sqrt(spread / total / np.maximum(says_at, 1))
+
+    off, trust, total = measure(predict_targets(graph, moved))
+    spread = np.bincount(ends, trust * off**2, count) + PRIOR_WEIGHT * ROBUST_SCALE_PX**2
+    return moved, np.sqrt(spread / total / np.maximum(np.bincount(ends, minlength=count), 1))
 
 
 def predict_targets(graph: FlatGraph, moved: np.ndarray) -> np.ndarray:

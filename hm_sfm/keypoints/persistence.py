@@ -73,7 +73,8 @@ def group_matches(names: Sequence[str], graph: FlatGraph, index: np.ndarray) -> 
     names: of the photos; index: (K,) int64, the index of each keypoint within its image.
     """
     image = graph.image
-    swap = np.array([names[a] > names[b] for a, b in zip(image[graph.source], image[graph.target])], dtype=bool)
+    rank = np.argsort(np.argsort(np.array(names, dtype=object), kind="stable"))
+    swap = rank[image[graph.source]] > rank[image[graph.target]]
     low, high = np.where(swap, graph.target, graph.source), np.where(swap, graph.source, graph.target)
     order = np.lexsort((-graph.score, high, low, image[high], image[low]))
     low, high, score = low[order], high[order], graph.score[order]
@@ -84,6 +85,6 @@ def group_matches(names: Sequence[str], graph: FlatGraph, index: np.ndarray) -> 
     matches = []
     for rows in np.split(np.arange(len(low)), np.flatnonzero(np.diff(pair_key)) + 1):
         if len(rows):
-            pair = ImagePair(names[image[low[rows[0]]]], names[image[high[rows[0]]]])
+            pair = ImagePair(*(names[int(image[side[rows[0]]])] for side in (low, high)))
             matches.append(IndexMatches(pair, np.stack([index[low[rows]], index[high[rows]]], axis=1), score[rows]))
     return tuple(matches)

@@ -67,11 +67,9 @@ def propagate_keypoints(
         min_score = 0.0 if photos[ends[0]].seeds_are_exact else config.propagation_min_score
         matches = matches.select(choose_good(matches.score, min_score, MIN_PROPAGATING))
         transfers = make_transfers(matches, *(photos[i].px_scale for i in ends))
-        swap = strength[ends[1]] > strength[ends[0]]
-        first, second = ends[::-1] if swap else ends
-        edges += propagate_pair(
-            first, second, transfers[::-1] if swap else transfers, photos, growing, seeds[first], config
-        )
+        if strength[ends[1]] > strength[ends[0]]:
+            ends, transfers = (ends[1], ends[0]), (transfers[1], transfers[0])
+        edges += propagate_pair(*ends, transfers, photos, growing, seeds[ends[0]], config)
     return KeypointGraph(tuple(photos), tuple(keypoints.xy for keypoints in growing), tuple(edges))
 
 

@@ -45,8 +45,8 @@ class Placement:
     linear: np.ndarray
     """(N, 2, 2): how xy1 moves with xy0."""
 
-    def select(self, chosen: slice) -> "Placement":
-        """The chosen ones."""
+    def select(self, chosen: np.ndarray) -> "Placement":
+        """Those that `chosen`, indices, names."""
         return Placement(self.xy0[chosen], self.xy1[chosen], self.linear[chosen])
 
 
@@ -76,9 +76,10 @@ class PatchRefiner:
         The score is the probability that a match is off by less than 1 px of the photo at `long_edge_px`; it is 0 where
         the patch is of no use. Raises InputError on an undecodable photo.
         """
-        names = (pair.name0, pair.name1)
-        hypotheses = fit_hypotheses(relate_inputs(*(self.encode(name, IDENTITY) for name in names), placement))
-        return self._estimate(*map(self.encode, names, hypotheses), pair, placement)
+        features0, features1 = self.encode(pair.name0, IDENTITY), self.encode(pair.name1, IDENTITY)
+        hypothesis0, hypothesis1 = fit_hypotheses(relate_inputs(features0, features1, placement))
+        features0, features1 = self.encode(pair.name0, hypothesis0), self.encode(pair.name1, hypothesis1)
+        return self._estimate(features0, features1, pair, placement)
 
     @torch.inference_mode()
     def _estimate(

@@ -150,10 +150,10 @@ def update_pair(
     updated, first = [], 0
     for number in numbers:
         edges = graph.edges[number]
-        these = slice(first, first + len(edges.source))
+        these = np.arange(first, first + len(edges.source))
         onward = graph.photos[edges.source_image].name == pair.name0
         updated.append(update_edges(edges, photos, onward, placement.select(these), refined.select(these)))
-        first = these.stop
+        first += len(these)
     kept = choose_good(np.concatenate([confirmed for _, confirmed in updated]), CONFIRMING_SCORE, MIN_CONFIRMED)
     ends = np.cumsum([len(confirmed) for _, confirmed in updated])[:-1]
     return [edges.select(kept_here) for (edges, _), kept_here in zip(updated, np.split(kept, ends))]

@@ -85,7 +85,7 @@ def transfer_points(xy: np.ndarray, transfer: PatchTransfer, radius: float) -> P
     homography = transfer.homography[patch]
     says = apply_homographies(homography, xy[at]).astype(np.float64)
     prior = weigh_scores(transfer.score[patch]) * (1.05 - distance / radius)
-    trust = prior
+    trust, predicted = prior, np.zeros((len(point), 2))
     for _ in range(AGREEMENT_ROUNDS):
         predicted = mean_in_groups(says, slot, trust, len(point))
         apart = np.linalg.norm(says - predicted[slot], axis=1)

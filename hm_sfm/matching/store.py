@@ -19,6 +19,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from hm_sfm.config import Config
 from hm_sfm.errors import InputError, StaleResultError
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
@@ -183,11 +184,21 @@ class MatchStore:
         except (OSError, KeyError, json.JSONDecodeError) as error:
             raise StaleResultError(f"{file} is damaged or no matches file: delete it ({error})") from error
 
-    def _compare_settings(self, file: Path, found: dict[str, Any]) -> None:
-        differing = sorted(key for key in found.keys() | self.made_by.keys() if found.get(key) != self.made_by.get(key))
-        if differing:
-            key = differing[0]
-            raise StaleResultError(
-                f"{file} was made with {key} {found.get(key)!r}, this run has {self.made_by.get(key)!r}: "
-                "name another OUT or delete it"
-            )
+    def _compare_settings(self, file: Path, made_by: dict[str, Any]) -> None:
+        for key in sorted(made_by.keys() | self.made_by.keys()):
+            if key not in self.made_by and "." in key and not is_setting(key):
+                raise StaleResultError(
+                    f"{file} was made by another version of hm_sfm, which had the setting {key}: name another OUT or "
+                    "delete it"
+                )
+            if made_by.get(key) != self.made_by.get(key):
+                raise StaleResultError(
+                    f"{file} was made with {key} {made_by.get(key)!r}, this run has {self.made_by.get(key)!r}: "
+                    "name another OUT or delete it"
+                )
+
+
+def is_setting(key: str) -> bool:
+    """Whether the configuration has the key `section.name`."""
+    section, _, name = key.partition(".")
+    return hasattr(getattr(Config(), section, None), name)

@@ -85,7 +85,7 @@ def read_database(path: Path, image_folder: Path) -> DatabaseContent:
         raise InputError(f"there is no database {path}")
     # COLMAP brings databases of earlier versions up to date as it opens them: not this one.
     with tempfile.TemporaryDirectory() as folder:
-        copy = shutil.copy(path, Path(folder) / "copy.db")
+        copy = Path(shutil.copy(path, Path(folder) / "copy.db"))
         try:
             with quiet_colmap(pycolmap.logging.FATAL), open_database(copy) as database:
                 rows = sorted(database.read_all_images(), key=lambda row: row.name)

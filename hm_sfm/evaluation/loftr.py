@@ -79,11 +79,11 @@ class LoftrMatcher:
         The public checkpoints were trained on COLMAP's cameras, so that their points are in its frame, as kornia
         says, too: nothing is added.
         """
-        found = self.net({"image0": features0.pixels, "image1": features1.pixels})
+        output = self.net({"image0": features0.pixels, "image1": features1.pixels})
         stored0, stored1 = features0.stored_from_scaled, features1.stored_from_scaled
-        xy0 = found["keypoints0"].double().cpu().numpy() @ stored0[:2, :2].T + stored0[:2, 2]
-        xy1 = found["keypoints1"].double().cpu().numpy() @ stored1[:2, :2].T + stored1[:2, 2]
-        score = found["confidence"].float().cpu().numpy()
+        xy0 = output["keypoints0"].double().cpu().numpy() @ stored0[:2, :2].T + stored0[:2, 2]
+        xy1 = output["keypoints1"].double().cpu().numpy() @ stored1[:2, :2].T + stored1[:2, 2]
+        score = output["confidence"].float().cpu().numpy()
         inside0, inside1 = (
             is_inside(xy, features.scaled_wh, features.stored_from_scaled)
             for xy, features in ((xy0, features0), (xy1, features1))

@@ -47,26 +47,26 @@ def make_keypoints(
     index_of: dict[str, list[np.ndarray]] = {}
     for image in images:
         points, votes = np.concatenate(xy[image.name]), np.concatenate(score[image.name])
-        unit = px_scale[image.name]
+        scale = px_scale[image.name]
         if cell_px is None:
             position, votes, index = merge_duplicates(points, votes)
         else:
-            points = points / unit
+            points = points / scale
             position, votes, _ = snap_points(points, votes, cell_px, VOTE_PX)
             position, votes = keep_most_voted(position, votes, max_keypoints)
             index, _ = find_nearest(points, position, VOTE_PX)
-            position = position * unit
-        keypoints.append(Keypoints(image.name, position, np.full(len(position), VOTE_PX * unit), votes))
+            position = position * scale
+        keypoints.append(Keypoints(image.name, position, np.full(len(position), VOTE_PX * scale), votes))
         ends = np.cumsum([len(part) for part in xy[image.name]])
         index_of[image.name] = np.split(index, ends[:-1])
 
-    turn = dict.fromkeys(xy, 0)
+    part = dict.fromkeys(xy, 0)
     matches = []
     for pair in pairs:
-        turn[pair.name0] += 1
-        turn[pair.name1] += 1
-        indices = np.stack([index_of[name][turn[name]] for name in (pair.name0, pair.name1)], axis=1)
-        strength = score[pair.name0][turn[pair.name0]]
+        part[pair.name0] += 1
+        part[pair.name1] += 1
+        indices = np.stack([index_of[name][part[name]] for name in (pair.name0, pair.name1)], axis=1)
+        strength = score[pair.name0][part[pair.name0]]
         placed = np.all(indices >= 0, axis=1)
         matches.append(IndexMatches.of_best(pair, indices[placed], strength[placed]))
     return tuple(keypoints), tuple(matches)
@@ -109,7 +109,7 @@ def number_squares(xy: np.ndarray, side_px: float) -> np.ndarray:
     return row * 2**32 + column
 
 
-def keep_most_voted(position: np.ndarray, votes: np.ndarray, budget: int) -> tuple[np.ndarray, np.ndarray]:
-    """The `budget` positions (K, 2) with most votes (K,), the first of equal ones, in their order; and their votes."""
-    kept = np.sort(np.argsort(-votes, kind="stable")[:budget])
+def keep_most_voted(position: np.ndarray, votes: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """The `most` positions (K, 2) with most votes (K,), the first of equal ones, in their order; and their votes."""
+    kept = np.sort(np.argsort(-votes, kind="stable")[:most])
     return position[kept], votes[kept]

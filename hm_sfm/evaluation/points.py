@@ -14,7 +14,7 @@ from hm_sfm.types import PatchMatches
 
 ERROR_LIMITS_PX = (1, 3, 5)
 CORRECT_LIMITS_PX = (3, 1)
-"""A match whose centre is nearer than this to the truth is correct."""
+"""A match whose centre is nearer than this to the ground truth is correct."""
 PATCH_POINTS = np.stack(np.meshgrid(np.arange(-4, 5), np.arange(-4, 5)), axis=-1).reshape(-1, 2)
 """(81, 2) px around a patch's centre: what the paper's r_e = 2 cells of the 1/2 grid hold."""
 CELL_PX = 8
@@ -22,7 +22,7 @@ CELL_PX = 8
 
 @dataclass(frozen=True)
 class MatchErrors:
-    """The M matches of a pair against the truth; an error is NaN where image 1 does not show the true point."""
+    """The M matches of a pair against the ground truth; an error is NaN where image 1 does not show the true point."""
 
     score: np.ndarray
     """(M,) float32."""
@@ -37,7 +37,7 @@ class MatchErrors:
 
 
 def measure_matches(matches: PatchMatches, b_from_a: np.ndarray, surface: np.ndarray) -> MatchErrors:
-    """Compare the matches of a training pair with its truth.
+    """Compare the matches of a training pair with its ground truth.
 
     b_from_a: (N, 3, 3) px of image 0 -> px of image 1 over each surface; surface: (H, W) int64, the surface at each
     pixel of image 0, -1 where image 1 does not show it.
@@ -112,7 +112,7 @@ def score_points(
 
 
 def summarise_errors(errors: Sequence[MatchErrors], min_score: float) -> dict[str, float]:
-    """The figures of score_points over the matches of all pairs with a score of at least min_score."""
+    """The metrics of score_points over the matches of all pairs with a score of at least min_score."""
     used = [pair.score >= min_score for pair in errors]
     centre_px = np.concatenate([pair.centre_px[chosen] for pair, chosen in zip(errors, used)])
     points_px = np.concatenate([pair.points_px[chosen].ravel() for pair, chosen in zip(errors, used)])
@@ -122,16 +122,16 @@ def summarise_errors(errors: Sequence[MatchErrors], min_score: float) -> dict[st
         hit = np.zeros(len(pair.visible), bool)
         hit[pair.cell[correct]] = True
         covered += int((hit & pair.visible).sum())
-    figures: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     for name, distances in (("points", points_px[~np.isnan(points_px)]), ("centres", centre_px[~np.isnan(centre_px)])):
-        figures[f"{name}_mean_px"] = float(distances.mean()) if len(distances) else np.nan
-        figures[f"{name}_median_px"] = float(np.median(distances)) if len(distances) else np.nan
+        metrics[f"{name}_mean_px"] = float(distances.mean()) if len(distances) else np.nan
+        metrics[f"{name}_median_px"] = float(np.median(distances)) if len(distances) else np.nan
         for limit in ERROR_LIMITS_PX:
-            figures[f"{name}_pck_{limit}px"] = measure_share((distances < limit).sum(), len(distances))
-    figures["mean_matches"] = len(centre_px) / len(errors)
+            metrics[f"{name}_pck_{limit}px"] = measure_share((distances < limit).sum(), len(distances))
+    metrics["mean_matches"] = len(centre_px) / len(errors)
     for limit in CORRECT_LIMITS_PX:
-        figures[f"correct_{limit}px"] = measure_share((centre_px < limit).sum(), len(centre_px))
-    return figures | {"coverage": measure_share(covered, sum(int(pair.visible.sum()) for pair in errors))}
+        metrics[f"correct_{limit}px"] = measure_share((centre_px < limit).sum(), len(centre_px))
+    return metrics | {"coverage": measure_share(covered, sum(int(pair.visible.sum()) for pair in errors))}
 
 
 def measure_share(part: int, whole: int) -> float:

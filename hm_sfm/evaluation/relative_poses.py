@@ -81,7 +81,8 @@ def read_strecha_pairs(scene: Path) -> list[PosePair]:
 def read_superglue_pairs(path: Path, image_folder: Path) -> list[PosePair]:
     """Pairs in SuperGlue's pairs_with_gt format.
 
-    A line holds two names, two EXIF rotations, K0, K1 and cam1_from_cam0. Their K counts the centre of the top-left pixel as (0, 0). Raises InputError on a malformed line.
+    A line holds two names, two EXIF rotations, K0, K1 and cam1_from_cam0. Their K counts the centre of the top-left
+    pixel as (0, 0). Raises InputError on a malformed line.
     """
     try:
         lines = Path(path).read_text().splitlines()

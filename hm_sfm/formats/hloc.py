@@ -4,7 +4,7 @@ features.h5 has a group per image, at the image's name (folders become groups): 
 attribute `uncertainty`, `scores` (K,) and `image_size` (2,). matches.h5 has a group per pair, `name0/name1` with every
 "/" inside a name replaced by "-": `matches0` (K0,), for each keypoint of image 0 its partner in image 1 or -1, and
 `matching_scores0` (K0,). hloc counts the centre of the top-left pixel as (0, 0) and adds the half pixel when it writes
-its COLMAP database; here it is added and taken off as the files are read and written.
+its COLMAP database; here it is added on reading and taken off on writing.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -53,15 +53,15 @@ def write_matches(
     """
     check_names([points.name for points in keypoints])
     count_of = {points.name: len(points) for points in keypoints}
-    found = {some.pair: some for some in matches}
+    matches_of = {some.pair: some for some in matches}
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with replace_file(path) as temporary, h5py.File(temporary, "w") as h5:
         for pair in pairs:
             partner = np.full(count_of[pair.name0], -1, np.int32)
             score = np.zeros(count_of[pair.name0], np.float32)
-            if pair in found:
-                first, second = found[pair].indices.T
-                partner[first], score[first] = second, found[pair].score
+            if pair in matches_of:
+                first, second = matches_of[pair].indices.T
+                partner[first], score[first] = second, matches_of[pair].score
             group = h5.create_group(name_group(pair.name0, pair.name1))
             group["matches0"] = partner
             group["matching_scores0"] = score
@@ -97,7 +97,7 @@ def read_keypoints(group: h5py.Group, path: Path, image: ImageRef) -> Keypoints:
         width, height = map(int, group["image_size"])
         raise InputError(
             f"{path} has the keypoints of an image {image.name!r} of {width} x {height} px, the photo has "
-            f"{image.size_wh[0]} x {image.size_wh[1]} px: it is of other photos, or of photos turned as EXIF says"
+            f"{image.size_wh[0]} x {image.size_wh[1]} px: it is of other photos, or of photos rotated as EXIF says"
         )
     xy = px_from_pixel_index(data[()].astype(np.float32))
     # Half precision rounds to whole pixels from 1024 on: a point at the edge may come to lie a bit outside.
@@ -120,13 +120,13 @@ def read_matches(path: Path, pairs: Sequence[ImagePair], keypoints: Sequence[Key
     count_of = {points.name: len(points) for points in keypoints}
     with open_h5(path) as h5:
         groups = [find_group(h5, pair) for pair in pairs]
-        missing = [pair for pair, found in zip(pairs, groups) if found is None]
+        missing = [pair for pair, group in zip(pairs, groups) if group is None]
         if missing:
             raise InputError(
                 f"{path} lacks {len(missing)} of {len(pairs)} pairs, for example {missing[0].name0!r} and "
                 f"{missing[0].name1!r}: it is of another run, or was made from another list of pairs"
             )
-        return tuple(read_pair(h5, path, pair, *found, count_of) for pair, found in zip(pairs, groups))
+        return tuple(read_pair(h5, path, pair, *group, count_of) for pair, group in zip(pairs, groups))
 
 
 def find_group(h5: h5py.File, pair: ImagePair, dataset: str = "matches0") -> tuple[str, bool] | None:

@@ -1,4 +1,4 @@
-"""Why photos are not in the model, and what to try: what `reconstruct` says where some fail to register."""
+"""Why photos are not in the model, and what to try: what `reconstruct` prints if some fail to register."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ MOST_LISTED = 4
 """Photos of one cause that a line names."""
 MOST_ANGLES = 8
 """Pairs of a photo whose triangulation angle is measured: a few ms each."""
-# COLMAP's mapper asks for so many points to register a photo, and for such an angle of a first pair, also after it has
-# relaxed its demands twice.
+# COLMAP's mapper needs this many points to register a photo, and this angle for a first pair, even after it has relaxed
+# its demands twice.
 FEWEST_POINTS = 30
 SMALLEST_ANGLE_DEG = 4.0
 
@@ -54,7 +54,7 @@ ADVICE = {
     Cause.SMALL_BASELINE: (FARTHER, INTRINSICS),
     Cause.NO_START: (BETWEEN, INTRINSICS, LARGER),
 }
-"""What to try, the most promising first; what is so already is left out."""
+"""What to try, the most promising first; choose_advice leaves out what is already the case."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Diagnosis:
 
     cause: Cause
     reasons: dict[str, str]
-    """Image name -> what was found, with numbers."""
+    """Image name -> the evidence, with numbers."""
     advice: tuple[str, ...]
 
     def __str__(self) -> str:
@@ -95,11 +95,11 @@ class Evidence:
 
     def partners(self, name: str) -> dict[str, np.ndarray]:
         """The images that have verified matches with image `name` -> (M,) int64 keypoints of `name`, most first."""
-        found = {}
+        keypoints_of = {}
         for pair, matches in self.verified.items():
             if name in (pair.name0, pair.name1):
-                found[pair.name1 if name == pair.name0 else pair.name0] = matches[:, int(name == pair.name1)]
-        return dict(sorted(found.items(), key=lambda item: (-len(item[1]), item[0])))
+                keypoints_of[pair.name1 if name == pair.name0 else pair.name0] = matches[:, int(name == pair.name1)]
+        return dict(sorted(keypoints_of.items(), key=lambda item: (-len(item[1]), item[0])))
 
 
 def diagnose(
@@ -133,7 +133,7 @@ def diagnose(
             for image, index in zip(images, cameras.camera_index)
         },
     )
-    found: dict[Cause, dict[str, str]] = {}
+    reasons_of: dict[Cause, dict[str, str]] = {}
     for name in missing:
         if name in model_of:
             number = model_of[name]
@@ -146,11 +146,11 @@ def diagnose(
             cause, reason = explain_unmapped(name, evidence)
         if INTRINSICS in ADVICE[cause] and not evidence.focal_known[name]:
             reason += ", focal length unknown"
-        found.setdefault(cause, {})[name] = reason
+        reasons_of.setdefault(cause, {})[name] = reason
     return tuple(
-        Diagnosis(cause, found[cause], choose_advice(cause, list(found[cause]), evidence))
+        Diagnosis(cause, reasons_of[cause], choose_advice(cause, list(reasons_of[cause]), evidence))
         for cause in Cause
-        if cause in found
+        if cause in reasons_of
     )
 
 
@@ -166,8 +166,8 @@ def explain_unverified(name: str, evidence: Evidence) -> tuple[Cause, str]:
     if not best:
         return Cause.UNPAIRED, "matched with no other photo"
     if most < checks.min_inliers:
-        found = f"at most {most}, with {best}" if most else "none with any photo"
-        return Cause.FEW_MATCHES, f"{found}; {checks.min_inliers} are needed"
+        counted = f"at most {most}, with {best}" if most else "none with any photo"
+        return Cause.FEW_MATCHES, f"{counted}; {checks.min_inliers} are needed"
     return Cause.DISAGREEING, f"{most} with {best}, too few of them agree"
 
 
@@ -212,8 +212,8 @@ def measure_angle(pair: ImagePair, evidence: Evidence) -> float:
         geometry = database.read_two_view_geometry(*(row.image_id for row in sides))
         cameras = [database.read_camera(row.camera_id) for row in sides]
         xy = [database.read_keypoints(row.image_id)[:, :2].astype(np.float64) for row in sides]
-    is_found = pycolmap.estimate_two_view_geometry_pose(cameras[0], xy[0], cameras[1], xy[1], geometry)
-    return float(np.degrees(geometry.tri_angle)) if is_found else 0.0
+    has_pose = pycolmap.estimate_two_view_geometry_pose(cameras[0], xy[0], cameras[1], xy[1], geometry)
+    return float(np.degrees(geometry.tri_angle)) if has_pose else 0.0
 
 
 def choose_advice(cause: Cause, names: Sequence[str], evidence: Evidence) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What a report tells, gathered from a finished run: figures per image, points and cameras to look at, weak pairs."""
+"""What a report shows, gathered from a finished run: metrics per image, points and cameras of the model, weak pairs."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -28,9 +28,9 @@ WEAK_PAIR_LINES = 80
 """Matches drawn of it."""
 JPEG_QUALITY = 75
 BASELINE = "loftr_style"
-"""What the methods of a comparison begin with that persistent keypoints are held against."""
+"""How the names of those methods of a comparison begin that persistent keypoints are compared with."""
 
-# The direction in a stored photo that is up when it is turned as EXIF says, by that clockwise turn.
+# By the clockwise rotation that EXIF asks for: the direction in the stored photo that is up after it.
 UP_IN_PHOTO = {0: (0, -1, 0), 90: (-1, 0, 0), 180: (0, 1, 0), 270: (1, 0, 0)}
 
 
@@ -92,8 +92,8 @@ class Report:
     images: tuple[ImageMetrics, ...]
     num_pairs: int
     """That were matched."""
-    links: Mapping[tuple[int, int], int]
-    """Two indices into `images` -> verified matches, of the verified pairs."""
+    verified_pairs: Mapping[tuple[int, int], int]
+    """Two indices into `images` -> number of verified matches."""
     scene: Scene | None
     """None where there is no model."""
     track_lengths: Mapping[str, Mapping[int, int]]
@@ -132,7 +132,7 @@ def gather_report(
         summary=summary,
         images=tuple(measure_images(images, model, keypoints, (point, image, keypoint), reasons)),
         num_pairs=num_pairs,
-        links={(index[pair.name0], index[pair.name1]): len(rows) for pair, rows in verified.items()},
+        verified_pairs={(index[pair.name0], index[pair.name1]): len(rows) for pair, rows in verified.items()},
         scene=lay_out_scene(model, {ref.name: ref.rotation_deg for ref in images}) if models else None,
         track_lengths={"this run": this_run, **read_baselines(out / "compare.json", len(images), config)},
         weak_pairs=draw_weak_pairs({ref.name: ref for ref in images}, model, verified, keypoints),
@@ -157,7 +157,7 @@ def measure_images(
     observations: tuple[np.ndarray, np.ndarray, np.ndarray],
     reasons: Mapping[str, str],
 ) -> list[ImageMetrics]:
-    """The figures of each image. observations: see list_observations, of the model."""
+    """The metrics of each image. observations: of the model, as list_observations returns them."""
     point, image, keypoint = observations
     registered = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
     neighbours = count_neighbours(build_tracks(point, image, keypoint), len(registered))
@@ -172,10 +172,10 @@ def measure_images(
         error_px = np.linalg.norm(projected - keypoints[posed.name][keypoint[rows]], axis=1)
         errors[posed.name] = float(np.nanmean(error_px)) if np.isfinite(error_px).any() else None
     number_of = {posed.name: number for number, posed in enumerate(registered)}
-    figures = []
+    metrics = []
     for ref in images:
         number = number_of.get(ref.name)
-        figures.append(
+        metrics.append(
             ImageMetrics(
                 name=ref.name,
                 registered=number is not None,
@@ -186,11 +186,11 @@ def measure_images(
                 reason=reasons.get(ref.name, ""),
             )
         )
-    return figures
+    return metrics
 
 
 def lay_out_scene(model: pycolmap.Reconstruction, rotation_deg: Mapping[str, int]) -> Scene:
-    """Points and cameras, turned upright and scaled. rotation_deg: by image name, see ImageRef."""
+    """Points and cameras, rotated upright and scaled. rotation_deg: by image name, see ImageRef."""
     posed = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
     ids = sorted(model.points3D)
     shown = np.unique(np.linspace(0, len(ids) - 1, min(len(ids), MOST_POINTS)).round().astype(np.int64))
@@ -200,9 +200,9 @@ def lay_out_scene(model: pycolmap.Reconstruction, rotation_deg: Mapping[str, int
 
     world_from_cam = [image.cam_from_world().inverse() for image in posed]
     centres = np.array([pose.translation for pose in world_from_cam]).reshape(-1, 3)
-    turns = [pose.rotation.matrix() for pose in world_from_cam]
-    up = np.sum([turn @ UP_IN_PHOTO[rotation_deg[image.name]] for turn, image in zip(turns, posed)], axis=0)
-    view_from_world = make_upright(up, np.sum([turn[:, 2] for turn in turns], axis=0))
+    rotations = [pose.rotation.matrix() for pose in world_from_cam]
+    up = np.sum([matrix @ UP_IN_PHOTO[rotation_deg[image.name]] for matrix, image in zip(rotations, posed)], axis=0)
+    view_from_world = make_upright(up, np.sum([matrix[:, 2] for matrix in rotations], axis=0))
 
     # A few points far behind everything else must not shrink the rest to a speck.
     inner = np.percentile(xyz, (3, 97), axis=0) if len(xyz) else np.zeros((0, 3))
@@ -223,7 +223,7 @@ def lay_out_scene(model: pycolmap.Reconstruction, rotation_deg: Mapping[str, int
 
 
 def make_upright(up: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """(3, 3) float64 rotation that puts `up` on +y and turns `forward` about it to -z; each (3,), of any length."""
+    """(3, 3) float64 rotation that maps `up` to +y and `forward`, about it, to -z; each (3,), of any length."""
     # Where the photos' directions cancel each other, any will do.
     y = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, -1.0, 0.0])
     back = -(forward - (forward @ y) * y)

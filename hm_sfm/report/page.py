@@ -15,8 +15,8 @@ import yaml
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.report.gather import ImageMetrics, Report, Scene, WeakPair
 
-MOST_LINKS = 4000
-"""Strongest links that the graph draws."""
+MOST_PAIRS = 4000
+"""Strongest verified pairs that the graph draws."""
 MOST_LABELS = 48
 """With more images than this, the graph names them only under the pointer."""
 LABEL_LENGTH = 20
@@ -56,7 +56,7 @@ def render_page(report: Report) -> str:
         scene=render_scene(report.scene, summary["models"]),
         images=render_images(report.images),
         track_lengths=render_track_lengths(report.track_lengths),
-        graph=render_graph(report.images, report.links),
+        graph=render_graph(report.images, report.verified_pairs),
         weak_pairs=render_weak_pairs(report.weak_pairs),
         timings=render_timings(summary["seconds"]),
         config=escape(yaml.safe_dump(dataclasses.asdict(report.config), sort_keys=False)),
@@ -64,14 +64,14 @@ def render_page(report: Report) -> str:
 
 
 def render_tiles(report: Report) -> str:
-    """The figures at the top."""
+    """The numbers at the top."""
     summary = report.summary
     tiles = [
         (f"{summary['registered']} / {summary['num_images']}", "images registered"),
         (f"{summary['points']:,}", "points"),
         (f"{summary['mean_track_length']:.2f}", "images per track"),
         (f"{summary['mean_reprojection_px']:.3f} px", "reprojection error"),
-        (f"{len(report.links):,} / {report.num_pairs:,}", "pairs verified"),
+        (f"{len(report.verified_pairs):,} / {report.num_pairs:,}", "pairs verified"),
     ]
     if summary["models"] > 1:
         tiles.append((str(summary["models"]), "models"))
@@ -199,11 +199,11 @@ def render_track_lengths(histograms: Mapping[str, Mapping[int, int]]) -> str:
 <p class="legend">{legend}</p>"""
 
 
-def render_graph(images: Sequence[ImageMetrics], links: Mapping[tuple[int, int], int]) -> str:
+def render_graph(images: Sequence[ImageMetrics], verified_pairs: Mapping[tuple[int, int], int]) -> str:
     """The images on a ring, in the order of their names; lines are the stronger the more matches a pair has."""
     angle = 2 * np.pi * np.arange(len(images)) / max(1, len(images)) - np.pi / 2
     x, y = RING * np.cos(angle), RING * np.sin(angle)
-    strongest = sorted(links.items(), key=lambda item: -item[1])[:MOST_LINKS]
+    strongest = sorted(verified_pairs.items(), key=lambda item: -item[1])[:MOST_PAIRS]
     most = max((count for _, count in strongest), default=1)
     parts = []
     for (first, second), count in reversed(strongest):
@@ -212,7 +212,7 @@ def render_graph(images: Sequence[ImageMetrics], links: Mapping[tuple[int, int],
             f'<line x1="{x[first]:.1f}" y1="{y[first]:.1f}" x2="{x[second]:.1f}" y2="{y[second]:.1f}" '
             f'stroke-opacity="{0.06 + 0.7 * strength:.2f}" stroke-width="{0.4 + 2.2 * strength:.1f}"/>'
         )
-    degree = np.bincount(np.array(list(links), np.int64).reshape(-1), minlength=len(images))
+    degree = np.bincount(np.array(list(verified_pairs), np.int64).reshape(-1), minlength=len(images))
     for number, image in enumerate(images):
         hint = f"{image.name}: {degree[number]} verified pairs" + ("" if image.registered else f", {image.reason}")
         state = "yes" if image.registered else "no"
@@ -222,19 +222,19 @@ def render_graph(images: Sequence[ImageMetrics], links: Mapping[tuple[int, int],
         )
         if len(images) <= MOST_LABELS:
             is_left = np.cos(angle[number]) < -1e-9
-            turn = np.degrees(angle[number]) + (180 if is_left else 0)
-            at = -(RING + 12) if is_left else RING + 12
+            angle_deg = np.degrees(angle[number]) + (180 if is_left else 0)
+            at, anchor = (-(RING + 12), "end") if is_left else (RING + 12, "start")
             name = image.name if len(image.name) <= LABEL_LENGTH else "\u2026" + image.name[1 - LABEL_LENGTH :]
             parts.append(
-                f'<text transform="rotate({turn:.1f})" x="{at}" y="4" text-anchor="{"end" if is_left else "start"}">'
-                f"{escape(name)}</text>"
+                f'<text transform="rotate({angle_deg:.1f})" x="{at}" y="4" text-anchor="{anchor}">{escape(name)}</text>'
             )
-    left_out = len(links) - len(strongest)
+    left_out = len(verified_pairs) - len(strongest)
     note = f" The {left_out:,} weakest are left out." if left_out else ""
     size = 2 * GRAPH_HALF
     return f"""<svg class="graph" viewBox="{-GRAPH_HALF} {-GRAPH_HALF} {size} {size}" role="img"
 aria-label="graph of the verified pairs">{"".join(parts)}</svg>
-<p class="note">{len(links):,} verified pairs; the strongest has {most if links else 0:,} matches.{note}</p>"""
+<p class="note">{len(verified_pairs):,} verified pairs; the strongest has {max(verified_pairs.values(), default=0):,}
+matches.{note}</p>"""
 
 
 def render_weak_pairs(weak_pairs: Sequence[WeakPair]) -> str:

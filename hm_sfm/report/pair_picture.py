@@ -53,9 +53,10 @@ def write_picture(path: Path, picture: np.ndarray) -> None:
 
 
 def draw_pair(matcher: HomoMatcher, path_a: Path, path_b: Path, checks: VerificationConfig) -> PairPicture:
-    """Match two photos and draw them: above, the good matches, green where they agree with one two-view geometry and
-    red where not; below, photo B warped into A by the homographies, black where there are none, and a checkerboard of
-    that and A.
+    """Match two photos and draw them.
+
+    Above are the good matches, green where they agree with one two-view geometry and red where not. Below are photo B
+    warped into A by the homographies, black where there are none, and a checkerboard of that and A.
 
     Raises InputError where a photo cannot be read.
     """
@@ -86,8 +87,10 @@ def draw_pair(matcher: HomoMatcher, path_a: Path, path_b: Path, checks: Verifica
 
 
 def warp_photo(photo_a: PreparedImage, photo_b: PreparedImage, matches: PatchMatches) -> tuple[np.ndarray, np.ndarray]:
-    """Photo B as it looks from A: (H, W) uint8 of A's size, black where no match covers a pixel, and which ones are
-    covered, (H, W) bool.
+    """Photo B as seen from A.
+
+    Returns an (H, W) uint8 image of A's size, black where no match covers a pixel, and which pixels are covered,
+    (H, W) bool.
     """
     height, width = photo_a.grey.shape
     row, column = np.indices((height, width))

@@ -25,7 +25,7 @@ def make_box(
     base_m: float = 0.0,
     texels_per_m: int = 160,
 ) -> tuple[Quad, ...]:
-    """Four sides and the top of an upright box `base_m` above the ground, turned about the vertical by `yaw_deg`."""
+    """Four sides and the top of an upright box `base_m` above the ground, rotated about the vertical by `yaw_deg`."""
     yaw = np.radians(yaw_deg)
     x, y = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
     length, depth, height = size_m
@@ -44,7 +44,7 @@ def make_box(
 def make_demo_scene(seed: int = 0) -> tuple[Quad, ...]:
     """A courtyard, about 12 m wide, open towards -y: paved ground, three walls, pillars, boxes, a leaning board.
 
-    The same for the same seed; another seed gives other textures, sizes and turns.
+    The same for the same seed; another seed gives other textures, sizes and rotations.
     """
     rng = np.random.default_rng(seed)
     quads = [
@@ -95,7 +95,7 @@ def _look_at(center: np.ndarray, target: np.ndarray, roll: float) -> np.ndarray:
 
 
 def expose_photo(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """What a camera makes of a rendered (H, W, 3) uint8 image: its own exposure, white balance and sensor noise."""
+    """A rendered (H, W, 3) uint8 image with a camera's exposure, white balance and sensor noise."""
     gains = np.exp(rng.normal(0, 0.07) + rng.normal(0, 0.015, 3)).astype(np.float32)
     light = image * gains
     light += rng.standard_normal(image.shape, dtype=np.float32) * np.sqrt(1.5 + 0.03 * light)

@@ -40,10 +40,10 @@ def _make_masonry(
     colours: list[tuple[int, int, int]],
     joint_colour: tuple[int, int, int],
     bend_px: float,
-    turned: bool = False,
+    vertical: bool = False,
 ) -> np.ndarray:
-    """Courses of stones, bricks or planks (turned: upright), no two alike: (H, W, 3) float32."""
-    if turned:
+    """Courses of stones, bricks or planks (vertical: upright), no two alike: (H, W, 3) float32."""
+    if vertical:
         args = (size_hw[::-1], stone_wh, joint_px, colours, joint_colour, bend_px)
         return np.ascontiguousarray(_make_masonry(rng, *args).transpose(1, 0, 2))
     height, width = size_hw
@@ -124,9 +124,9 @@ def _make_plaster(rng: np.random.Generator, size_hw: tuple[int, int], texels_per
 def _make_planks(rng: np.random.Generator, size_hw: tuple[int, int], texels_per_m: int) -> np.ndarray:
     m = texels_per_m
     colours = [(150, 112, 74), (128, 92, 60), (170, 132, 90), (112, 88, 66), (140, 120, 96)]
-    turned = bool(rng.integers(0, 2))
-    wood = _make_masonry(rng, size_hw, (1.3 * m, 0.13 * m), 0.008 * m, colours, (48, 36, 28), 0.003 * m, turned)
-    along = (0.02 * m, 0.5 * m) if turned else (0.5 * m, 0.02 * m)
+    vertical = bool(rng.integers(0, 2))
+    wood = _make_masonry(rng, size_hw, (1.3 * m, 0.13 * m), 0.008 * m, colours, (48, 36, 28), 0.003 * m, vertical)
+    along = (0.02 * m, 0.5 * m) if vertical else (0.5 * m, 0.02 * m)
     wood *= 1 + 0.13 * _make_noise(rng, size_hw, along, 4)[..., None]
     knots = round(size_hw[0] * size_hw[1] / m**2 * 12)
     _scatter_specks(rng, wood, knots, 0.02 * m, [(66, 44, 30), (84, 58, 38)])

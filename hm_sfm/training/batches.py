@@ -26,15 +26,15 @@ def make_pairs(photos: list[np.ndarray], config: TrainConfig, seed: int, count: 
     size_wh = (config.size_px, config.size_px)
     rest = 1 - config.rendered_share - config.real_share - config.megadepth_share
     kinds: list[tuple[Dataset, float]] = [
-        # What is left over by rounding is no share.
+        # A remainder due to rounding is no share.
         (WarpedPhotos(photos, size_wh, seed, count, config.warp), rest if rest > 1e-9 else 0.0),
         (RenderedScenes(photos, size_wh, seed, count, config.views), config.rendered_share),
     ]
     if config.real_share:
         source = config.multiview
         names = VALIDATION_SCENES if held_out else None
-        found = read_photo_pairs(Path(source.tracks), Path(source.photos), names)
-        kinds.append((PhotoPairs(found, size_wh, seed, count), config.real_share))
+        scenes = read_photo_pairs(Path(source.tracks), Path(source.photos), names)
+        kinds.append((PhotoPairs(scenes, size_wh, seed, count), config.real_share))
     if config.megadepth_share:
         source = config.megadepth
         scene_info = Path(source.validation_info if held_out else source.scene_info)
@@ -46,7 +46,7 @@ def make_pairs(photos: list[np.ndarray], config: TrainConfig, seed: int, count: 
 def iterate_batches(
     pairs: Dataset, pairs_per_step: int, first_step: int, processes: Processes
 ) -> Iterator[dict[str, Tensor]]:
-    """This process's share of each step's pairs, from step `first_step` on, prepared in processes of their own."""
+    """The share of each step's pairs that this process takes, from `first_step` on, prepared by worker processes."""
     share = pairs_per_step // processes.count
     first_pair = first_step * pairs_per_step + processes.rank * share
     batches = [range(pair, pair + share) for pair in range(first_pair, len(pairs), pairs_per_step)]
@@ -62,7 +62,7 @@ def iterate_batches(
 
 
 def read_batches(loader: DataLoader) -> Iterator[dict[str, Tensor]]:
-    """The batches of a loader. The errors of its processes come as these raised them, without traces in their text."""
+    """The batches of a loader. Errors of its worker processes are raised without the traces in their text."""
     try:
         yield from loader
     except HmSfmError as error:

@@ -1,4 +1,4 @@
-"""What a training looks like: the curves of log.csv and validation.csv as a picture."""
+"""The curves of a training: log.csv and validation.csv as a picture."""
 
 import csv
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Planar facets that carry photos, and the things made of them: boards, boxes and reliefs."""
+"""Planar facets textured with photos, and the things made of them: boards, boxes and reliefs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,8 +24,9 @@ class Texture:
         self.reduced: dict[tuple[int, int], np.ndarray] = {}
 
     def reduce(self, steps_u: int, steps_v: int) -> tuple[np.ndarray, np.ndarray]:
-        """The texture with its columns reduced by 2^(steps_u / 2), its rows by 2^(steps_v / 2), (H', W') uint8, and
-        the (3, 3) transform from px of the photo to px of that.
+        """The texture with its columns reduced by 2^(steps_u / 2) and its rows by 2^(steps_v / 2).
+
+        Returns (H', W') uint8 and the (3, 3) transform from px of the photo to px of it.
         """
         height, width = self.photo.shape
         size_wh = max(1, round(width * 2 ** (-steps_u / 2))), max(1, round(height * 2 ** (-steps_v / 2)))
@@ -72,9 +73,9 @@ class Facet:
 
 
 def make_board(photo: np.ndarray, centre: np.ndarray, rotation: np.ndarray, side: float, focal_px: float) -> Facet:
-    """A rectangle of the photo's shape, `side` wide, with the photo on it; rotation (3, 3) turns it about its centre.
+    """A rectangle of the photo's shape, `side` wide, with the photo on it; rotation (3, 3) is about its centre.
 
-    Large ones carry the photo several times, mirrored, so that cameras of focal_px see it about as large as it is.
+    Large ones repeat the photo, mirrored, so that cameras of focal_px see it at about its own resolution.
     """
     height, width = photo.shape
     copies = count_copies(side, centre[2], width, focal_px)

@@ -39,7 +39,7 @@ from hm_sfm.training.state import (
 logger = logging.getLogger(__name__)
 
 HELD_OUT_PAIRS = 96
-"""Pairs that a validation looks at."""
+"""Number of pairs in the validation set."""
 
 
 def train(config: TrainConfig, resume: bool = False, quiet: bool = False) -> Path:
@@ -110,10 +110,10 @@ def run_training(config: TrainConfig, resume: bool, quiet: bool, processes: Proc
 def train_step(
     state: TrainState, batch: dict[str, Tensor], config: TrainConfig, device: torch.device, processes: Processes
 ) -> dict:
-    """One update of weights and average, by this process's share of the pairs; returns the row for log.csv, which is
-    the same in all processes but for the seconds.
+    """One update of weights and average, by this process's share of the pairs.
 
-    Raises HmSfmError, in all processes, on a loss or gradient that is not finite.
+    Returns the row for log.csv, which is the same in all processes but for the seconds. Raises HmSfmError, in all
+    processes, on a loss or gradient that is not finite.
     """
     started = time.monotonic()
     rate = learning_rate_at(state.step, config)

@@ -1,4 +1,4 @@
-"""The losses of both stages (section 3.3 of the paper), and the error measures they are judged by."""
+"""The losses of both stages (section 3.3 of the paper), and the errors that they are made of."""
 
 import torch
 from torch import Tensor
@@ -22,24 +22,25 @@ COARSE_TRUNCATION = 0.25
 UNBOUNDED_SHARE = 0.1
 """Of -log P in the coarse loss."""
 COARSE_MATCHES = 1000
-"""Supervised per pair; more of them say little new."""
+"""Supervised per pair; more of them add little."""
 FLOW_WEIGHT = 0.1
 """Of the flows' likelihood beside the coarse loss, as in ASpanFormer."""
 LARGEST_ERROR = 8.0
-"""Cells: what the error scale of a wrong match is taught."""
+"""Cells: the error that supervises the error scale of a wrong match."""
 
 
-def measure_errors(estimate: FineEstimate, truth: PatchSupervision, dense: bool = True) -> Tensor:
-    """(P, 81) float32 cells: distance of the predicted from the true dense points of each patch; dense False: (P, 1),
-    that of its centre alone.
+def measure_errors(estimate: FineEstimate, supervision: PatchSupervision, dense: bool = True) -> Tensor:
+    """(P, 81) float32 cells: distance of the predicted from the true dense points of each patch.
+
+    dense False: (P, 1), that of its centre alone.
     """
-    points = make_patch_grid(DENSE_RADIUS if dense else 0.0, DENSE_STEP, truth.homography.device)
+    points = make_patch_grid(DENSE_RADIUS if dense else 0.0, DENSE_STEP, supervision.homography.device)
     predicted = apply_homography(estimate.homography, points)
-    return (predicted - apply_homography(truth.homography, points)).norm(dim=-1)
+    return (predicted - apply_homography(supervision.homography, points)).norm(dim=-1)
 
 
 def measure_loss(
-    estimates: list[FineEstimate], truth: PatchSupervision, half: float, dense: bool = True
+    estimates: list[FineEstimate], supervision: PatchSupervision, half: float, dense: bool = True
 ) -> dict[str, Tensor]:
     """Scalars `loss` and its parts `dense`, `corner` (relative to the patch's half side) and `scale`.
 
@@ -48,15 +49,15 @@ def measure_loss(
     patches: pairs of real photos have none. dense False: the centre of the patch stands for its points, and the corners
     supervise nothing.
     """
-    correct = truth.correct
+    correct = supervision.correct
     count = correct.sum().clamp_min(1)
-    zero = truth.homography.new_zeros(())
+    zero = supervision.homography.new_zeros(())
     parts = {"dense": zero, "corner": zero, "scale": zero}
     for age, estimate in enumerate(reversed(estimates)):
         weight = DISCOUNT**age
-        errors = measure_errors(estimate, truth, dense).mean(dim=1)
+        errors = measure_errors(estimate, supervision, dense).mean(dim=1)
         regular = correct & is_regular(estimate.homography.detach(), half)
-        corner = (estimate.displacement - truth.displacement).abs().mean(dim=(1, 2))
+        corner = (estimate.displacement - supervision.displacement).abs().mean(dim=(1, 2))
         known = torch.where(correct, errors.detach(), errors.new_tensor(LARGEST_ERROR)).clamp(0.02, LARGEST_ERROR)
         likelihood = estimate.log_scale + known * torch.exp(-estimate.log_scale)
         parts["dense"] = parts["dense"] + weight * torch.where(regular, errors, 0.0).sum() / count / half
@@ -66,26 +67,29 @@ def measure_loss(
     return {"loss": loss} | parts
 
 
-def measure_point_loss(estimates: list[FineEstimate], truth: PointSupervision, half: float) -> Tensor:
-    """The loss of patches of which one pair of points is known, a scalar: its error beyond TEACHER_ERROR, where the
-    estimate is regular, and the error scale; weighted as in measure_loss.
+def measure_point_loss(estimates: list[FineEstimate], supervision: PointSupervision, half: float) -> Tensor:
+    """The loss of patches of which one pair of points is known, a scalar.
+
+    It is the error beyond TEACHER_ERROR, where the estimate is regular, and that of the error scale, weighted as in
+    measure_loss.
     """
-    count = truth.correct.sum().clamp_min(1)
-    total = truth.point0.new_zeros(())
+    count = supervision.correct.sum().clamp_min(1)
+    total = supervision.point0.new_zeros(())
     for age, estimate in enumerate(reversed(estimates)):
-        moved = apply_homography(estimate.homography, truth.point0[:, None])[:, 0]
-        error = ((moved - truth.point1).norm(dim=-1) - TEACHER_ERROR).clamp_min(0)
-        regular = truth.correct & is_regular(estimate.homography.detach(), half)
-        known = torch.where(truth.correct, error.detach(), LARGEST_ERROR).clamp(0.02, LARGEST_ERROR)
+        moved = apply_homography(estimate.homography, supervision.point0[:, None])[:, 0]
+        error = ((moved - supervision.point1).norm(dim=-1) - TEACHER_ERROR).clamp_min(0)
+        regular = supervision.correct & is_regular(estimate.homography.detach(), half)
+        known = torch.where(supervision.correct, error.detach(), LARGEST_ERROR).clamp(0.02, LARGEST_ERROR)
         likelihood = estimate.log_scale + known * torch.exp(-estimate.log_scale)
         dense = torch.where(regular, error, 0.0).sum() / count / half
         total = total + DISCOUNT**age * (dense + SCALE_WEIGHT * likelihood.sum() / max(len(known), 1))
     return total
 
 
-def measure_coarse_loss(coarse0: Tensor, coarse1: Tensor, sharpness: Tensor, truth: CoarseSupervision) -> Tensor:
-    """L_c: how far the confidence P of the true matches (LoFTR's dual softmax) is from 1, mean over each pair's matches
-    and then over the pairs, a scalar; 0 without matches.
+def measure_coarse_loss(coarse0: Tensor, coarse1: Tensor, sharpness: Tensor, supervision: CoarseSupervision) -> Tensor:
+    """L_c: how far the confidence P of the true matches (LoFTR's dual softmax) is from 1.
+
+    A scalar: the mean over each pair's matches and then over the pairs; 0 without matches.
 
     LoFTR takes -log P. Ours is mostly (1 - P**q) / q, which becomes -log P as q goes to 0 (Zhang and Sabuncu, NeurIPS
     2018): matches that are hopeless, or were wrong in the first place, do not drown the others. A share of -log P
@@ -95,9 +99,9 @@ def measure_coarse_loss(coarse0: Tensor, coarse1: Tensor, sharpness: Tensor, tru
     """
     losses = []
     for item in range(len(coarse0)):
-        own = (truth.image_index == item).nonzero().flatten()
+        own = (supervision.image_index == item).nonzero().flatten()
         own = own[:: len(own) // COARSE_MATCHES + 1]
-        index0, index1 = truth.index0[own, None], truth.index1[own, None]
+        index0, index1 = supervision.index0[own, None], supervision.index1[own, None]
         rows = sharpness * coarse0[item, index0[:, 0]] @ coarse1[item].T
         columns = sharpness * coarse1[item, index1[:, 0]] @ coarse0[item].T
         confidence = rows.log_softmax(dim=1).gather(1, index1) + columns.log_softmax(dim=1).gather(1, index0)
@@ -107,23 +111,25 @@ def measure_coarse_loss(coarse0: Tensor, coarse1: Tensor, sharpness: Tensor, tru
     return torch.stack(losses).mean() if losses else coarse0.sum() * 0
 
 
-def measure_flow_loss(flows: list[tuple[Flow, Flow]], truth: CoarseSupervision) -> Tensor:
-    """How unlikely the true matches are under the flows of ASpanFormer's blocks (L_flow, section 3 of its paper): the
-    negative log-likelihood, without its constant, summed over both axes; mean over matches, directions and blocks, a
-    scalar; 0 without matches.
+def measure_flow_loss(flows: list[tuple[Flow, Flow]], supervision: CoarseSupervision) -> Tensor:
+    """How unlikely the true matches are under the flows of ASpanFormer's blocks (L_flow, section 3 of its paper).
 
-    flows: of each block, from image 0 to image 1 and back. The centre of the true match's cell stands for the truth: it
-    is half a cell off at most.
+    A scalar: the negative log-likelihood, without its constant, summed over both axes; the mean over matches,
+    directions and blocks; 0 without matches.
+
+    flows: of each block, from image 0 to image 1 and back. The centre of the true match's cell stands for the true
+    point: it is at most half a cell off.
     """
     losses = []
     for flow0, flow1 in flows:
         for flow, other, own_index, other_index in (
-            (flow0, flow1, truth.index0, truth.index1),
-            (flow1, flow0, truth.index1, truth.index0),
+            (flow0, flow1, supervision.index0, supervision.index1),
+            (flow1, flow0, supervision.index1, supervision.index0),
         ):
             columns = other.centre.shape[3]
             true = torch.stack([other_index % columns, other_index // columns], dim=1)
-            centre, log_sigma = (x.flatten(2)[truth.image_index, :, own_index] for x in (flow.centre, flow.log_sigma))
+            own = supervision.image_index, slice(None), own_index
+            centre, log_sigma = flow.centre.flatten(2)[own], flow.log_sigma.flatten(2)[own]
             surprise = log_sigma + 0.5 * ((true - centre) * torch.exp(-log_sigma)).square()
             losses.append(surprise.sum() / max(len(true), 1))
     return torch.stack(losses).mean()

@@ -34,7 +34,7 @@ PLANE_TOLERANCE_PX = 0.5
 PLANAR_SHARE = 0.75
 """Of the pixels around a block that must have a depth and lie on its plane; at depth edges fewer do."""
 ROUND_TRIP_PX = 1.0
-"""How far from a pixel of A its partner may land when it is carried back by the depth that B has there."""
+"""How far from a pixel of A its partner may land when it is transferred back by the depth that B has there."""
 DEPTH_TOLERANCE = 0.02
 """Largest relative difference of the two depths of a point in B. LoFTR's is 0.2, enough for its cells of 8 px; the
 round trip is the stricter of the two except where there is little parallax."""

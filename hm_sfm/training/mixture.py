@@ -25,8 +25,10 @@ class MixedPairs(Dataset):
 
 
 def collate_pairs(items: Sequence[dict[str, np.ndarray]]) -> dict[str, Tensor]:
-    """One batch of items. Kinds of pairs differ in their number of surfaces: b_from_a (P, 3, 3) of each item is filled
-    up to the longest with zeros, which no pixel refers to.
+    """One batch of items.
+
+    Kinds of pairs differ in their number of surfaces: b_from_a (P, 3, 3) of each item is padded to the longest with
+    zeros, which no pixel refers to.
     """
     longest = max(len(item["b_from_a"]) for item in items)
     return default_collate(

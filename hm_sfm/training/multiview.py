@@ -1,7 +1,7 @@
 """Training pairs of real photos: views of scenes that were reconstructed by teachers, supervised by their tracks.
 
-A scene is known by the tracks of its models only (pipelines/training/make_teacher_tracks.py): which point is seen where. Two
-photos that share tracks are a pair, however far apart they are, whether a teacher matched them directly or not.
+Only the tracks of its models are known of a scene (pipelines/training/make_teacher_tracks.py): which point is seen
+where. Two photos that share tracks are a pair, however far apart they are, even if no teacher matched them directly.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ FEWEST_SHARED = 30
 LARGEST_RATIO = 1.4
 """Of the two views' scales, beyond that of the photos themselves."""
 TURN_DEG = 10.0
-"""Standard deviation of the turn between the views of every third pair."""
+"""Standard deviation of the rotation between the views of every third pair."""
 VALIDATION_SCENES = (
     "as_meganerf_rubble",
     "british_museum",
@@ -62,13 +62,13 @@ def write_tracks(path: Path, models: Sequence[pycolmap.Reconstruction]) -> None:
 
 def _project_observations(model: pycolmap.Reconstruction, image: pycolmap.Image) -> tuple[np.ndarray, np.ndarray]:
     """(N,) int64 point ids and (N, 2) float32 px: the points that the image observes well, each once."""
-    found = {}
+    xy_of = {}
     for observation in image.get_observation_points2D():
         projected = image.project_point(model.points3D[observation.point3D_id].xyz)
         if projected is not None and np.linalg.norm(projected - observation.xy) <= LARGEST_ERROR_PX:
-            found[observation.point3D_id] = projected
-    point = np.array(sorted(found), dtype=np.int64)
-    return point, np.array([found[key] for key in point.tolist()], dtype=np.float32).reshape(-1, 2)
+            xy_of[observation.point3D_id] = projected
+    point = np.array(sorted(xy_of), dtype=np.int64)
+    return point, np.array([xy_of[key] for key in point.tolist()], dtype=np.float32).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
@@ -88,9 +88,9 @@ def read_photo_pairs(tracks: Path, photos: Path, names: Sequence[str] | None = N
     tracks: folder of <scene>/tracks.h5; photos: folder of <scene>/ with the photos. Scenes without a pair are left
     out. Raises InputError where nothing is left, or a tracks file names a photo that is not there.
     """
-    found = {path.parent.name: path for path in sorted(Path(tracks).glob("*/tracks.h5"))}
-    chosen = [name for name in found if (name not in VALIDATION_SCENES if names is None else name in names)]
-    scenes = [pairs for name in chosen if (pairs := _read_scene(found[name], Path(photos) / name))]
+    path_of = {path.parent.name: path for path in sorted(Path(tracks).glob("*/tracks.h5"))}
+    chosen = [name for name in path_of if (name not in VALIDATION_SCENES if names is None else name in names)]
+    scenes = [pairs for name in chosen if (pairs := _read_scene(path_of[name], Path(photos) / name))]
     if not scenes:
         raise InputError(f"{tracks} holds no tracks of scenes to train on: make them with make_teacher_tracks.py")
     return scenes
@@ -165,8 +165,10 @@ class PhotoPairs(Dataset):
     def _draw_window(
         self, shape_hw: tuple[int, int], anchor: np.ndarray, scale: float, rotation_deg: float, rng: np.random.Generator
     ) -> np.ndarray:
-        """(3, 3) px of the photo -> px of the view. The view shows the photo's point `anchor`, and no more of what is
-        beyond the photo's borders than it must (but for the turn).
+        """(3, 3) px of the photo -> px of the view.
+
+        The view shows the photo's point `anchor`, and, but for the rotation, no more than it must of what lies beyond
+        the photo's borders.
         """
         cosine, sine = scale * np.cos(np.radians(rotation_deg)), scale * np.sin(np.radians(rotation_deg))
         matrix = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])

@@ -1,4 +1,4 @@
-"""What a batch of training pairs says about the network: the losses of its stages, and how it does on kept pairs."""
+"""What a batch of training pairs says about the network: the losses of its stages, and scores on held-out pairs."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -31,7 +31,7 @@ from hm_sfm.training.supervision import (
 )
 
 NEAR_CELLS = 1
-"""A coarse match this far from the truth, along each axis, is one that the fine stage can mend."""
+"""A coarse match this far from the ground truth, along each axis, is one that the fine stage can correct."""
 
 
 def run_backbone(net: HomoNet, images: Tensor, want_fine: bool) -> FeatureMaps:
@@ -44,8 +44,9 @@ def run_backbone(net: HomoNet, images: Tensor, want_fine: bool) -> FeatureMaps:
 
 
 def run_coarse(net: HomoNet, maps: FeatureMaps) -> tuple[Tensor, Tensor, list[tuple[Flow, Flow]]]:
-    """(B, N, C) float32 of both views: cells as the coarse stage compares them; and the flows, from A to B and back, by
-    which it found them, none where it works without.
+    """Cells as the coarse stage compares them, (B, N, C) float32 of both views, and its flows.
+
+    The flows are those of each block, from A to B and back; a coarse stage without flows has none.
     """
     described = net.coarse.describe(maps.coarse).flatten(2).transpose(1, 2).unflatten(0, (-1, 2))
     flows = []
@@ -56,11 +57,11 @@ def run_coarse(net: HomoNet, maps: FeatureMaps) -> tuple[Tensor, Tensor, list[tu
     return coarse0.float(), coarse1.float(), flows
 
 
-def run_fine(net: HomoNet, maps: FeatureMaps, truth: PatchSupervision | PointSupervision) -> list[FineEstimate]:
+def run_fine(net: HomoNet, maps: FeatureMaps, supervision: PatchSupervision | PointSupervision) -> list[FineEstimate]:
     """The head's estimates of the supervised patches."""
     fine = maps.fine.unflatten(0, (-1, 2))
     fine0, fine1 = make_fine_map(fine[:, 0]), make_fine_map(fine[:, 1])
-    return net.head(fine0, fine1, truth.image_index, truth.cell0, truth.cell1)
+    return net.head(fine0, fine1, supervision.image_index, supervision.cell0, supervision.cell1)
 
 
 def measure_objective(
@@ -73,15 +74,16 @@ def measure_objective(
     generator: torch.Generator,
     supervise: str = "suppressed",
 ) -> dict[str, Tensor]:
-    """Scalars `loss` and its parts for a batch of training pairs; stage: coarse | fine | joint; supervise: what of the
-    fine stage, as in TrainConfig.
+    """Scalars `loss` and its parts for a batch of training pairs.
+
+    stage: coarse | fine | joint; supervise: what of the fine stage is supervised, as in TrainConfig.
     """
     jittered_share = JITTERED_SHARE if supervise == "suppressed" else 0.0
     with autocast(precision, device):
         maps = run_backbone(net, batch["images"].to(device), stage != "coarse")
         parts = {"loss": torch.zeros((), device=device)}
         if stage != "fine":
-            truth = to_device(supervise_coarse(net, batch), device)
+            supervision = to_device(supervise_coarse(net, batch), device)
             coarse0, coarse1, flows = run_coarse(net, maps)
         if stage != "coarse":
             patches = to_device(supervise_fine(net, batch, patches_per_pair, generator, jittered_share), device)
@@ -89,10 +91,10 @@ def measure_objective(
             estimates = run_fine(net, maps, patches)
             point_estimates = run_fine(net, maps, points) if len(points.image_index) else []
     if stage != "fine":
-        parts["coarse"] = measure_coarse_loss(coarse0, coarse1, net.coarse.sharpness, truth)
+        parts["coarse"] = measure_coarse_loss(coarse0, coarse1, net.coarse.sharpness, supervision)
         parts["loss"] = parts["loss"] + parts["coarse"]
         if flows:
-            parts["flow"] = measure_flow_loss(flows, truth)
+            parts["flow"] = measure_flow_loss(flows, supervision)
             parts["loss"] = parts["loss"] + FLOW_WEIGHT * parts["flow"]
     if stage != "coarse":
         fine = measure_loss(estimates, patches, net.head.half, dense=supervise != "centre")
@@ -114,7 +116,7 @@ def supervise_fine(
     generator: torch.Generator,
     jittered_share: float = JITTERED_SHARE,
 ) -> PatchSupervision:
-    """Patches of a batch and their truth."""
+    """Patches of a batch and their supervision."""
     grids = net.backbone.coarse_grid, net.backbone.fine_grid
     return draw_patches(
         batch["b_from_a"], batch["surface"], patches_per_pair, *grids, net.head.half, generator, jittered_share
@@ -147,24 +149,25 @@ def score_network(
     device: torch.device,
     generator: torch.Generator,
 ) -> dict[str, float]:
-    """How the network does on held-out pairs.
+    """Metrics of the network on held-out pairs.
 
-    coarse: `recall` and `precision` in percent, mean over the pairs, of the true coarse matches: found, and among the
-    answers to them right, to within a cell; for pairs with known surfaces (rendered) and for those of real photos.
+    coarse: `recall` and `precision` in percent, mean over the pairs: the share of the true coarse matches that are
+    matched right, to within a cell, and the share of right ones among those that are matched at all; for pairs with
+    known surfaces (rendered) and for those of real photos.
     fine: errors of the dense points of correct patches, px of the network's input.
     """
-    errors, found = [torch.zeros(0)], {"rendered": [], "real": []}
+    errors, coarse_scores = [torch.zeros(0)], {"rendered": [], "real": []}
     for batch in batches:
         with autocast(precision, device):
             maps = run_backbone(net, batch["images"].to(device), stage != "coarse")
             if stage != "fine":
-                score_coarse(net, maps, batch, coarse_threshold, found)
+                score_coarse(net, maps, batch, coarse_threshold, coarse_scores)
             if stage != "coarse":
                 patches = to_device(supervise_fine(net, batch, patches_per_pair, generator), device)
                 estimates = run_fine(net, maps, patches)
                 errors.append(measure_errors(estimates[-1], patches)[patches.correct].flatten().cpu())
     scores = {}
-    for kind, pairs in found.items():
+    for kind, pairs in coarse_scores.items():
         if pairs:
             recall, precise = torch.tensor(pairs).mean(dim=0).tolist()
             scores |= {f"{kind}_recall": 100 * recall, f"{kind}_precision": 100 * precise}
@@ -176,31 +179,33 @@ def score_network(
 
 
 def score_coarse(
-    net: HomoNet, maps: FeatureMaps, batch: dict[str, Tensor], threshold: float, found: dict[str, list]
+    net: HomoNet, maps: FeatureMaps, batch: dict[str, Tensor], threshold: float, scores: dict[str, list]
 ) -> None:
-    """Append (recall, precision) of each pair of a batch to `found`, by kind of pair."""
-    truth = supervise_coarse(net, batch)
+    """Append (recall, precision) of each pair of a batch to `scores`, by kind of pair."""
+    supervision = supervise_coarse(net, batch)
     described = net.coarse.describe(maps.coarse)
     columns = described.shape[3]
     cells = described.flatten(2).transpose(1, 2).unflatten(0, (-1, 2))
     for item, (cells0, cells1) in enumerate(cells):
-        own = truth.image_index == item
+        own = supervision.image_index == item
         if not own.any():
             continue
         index0, index1, _ = (x.cpu() for x in net.coarse.match(cells0, cells1, threshold))
         answer = torch.full((len(cells0),), -1)
         answer[index0] = index1
-        given, true = answer[truth.index0[own]], truth.index1[own]
+        given, true = answer[supervision.index0[own]], supervision.index1[own]
         apart = torch.maximum((given % columns - true % columns).abs(), (given // columns - true // columns).abs())
         answered = given >= 0
         right = (answered & (apart <= NEAR_CELLS)).sum().item()
         kind = "rendered" if (batch["surface"][item] >= 0).any() else "real"
-        found[kind].append((right / len(true), right / max(answered.sum().item(), 1)))
+        scores[kind].append((right / len(true), right / max(answered.sum().item(), 1)))
 
 
-def to_device(truth, device: torch.device):
+def to_device(supervision, device: torch.device):
     """The same supervision with its tensors on `device`."""
-    return type(truth)(*(getattr(truth, field.name).to(device) for field in dataclasses.fields(truth)))
+    return type(supervision)(
+        *(getattr(supervision, field.name).to(device) for field in dataclasses.fields(supervision))
+    )
 
 
 def autocast(precision: str, device: torch.device) -> AbstractContextManager:

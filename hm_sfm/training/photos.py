@@ -68,7 +68,9 @@ def split_photos(photos: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.nd
 
 
 class WarpedPhotos(Dataset):
-    """Items, of views of size_wh = (W, H) px: images (2, H, W) uint8, b_from_a (SURFACES, 3, 3) float32 (px of view
+    """Pairs of warped views of photos.
+
+    Items, of views of size_wh = (W, H) px: images (2, H, W) uint8, b_from_a (SURFACES, 3, 3) float32 (px of view
     A -> px of view B, by surface), surface (H, W) int64 (the surface at each pixel of A, -1 where B does not show it)
     and points (POINTS, 4) float32, all NaN: x0, y0, x1, y1 px of single points for kinds of pairs without surfaces.
     """

@@ -52,8 +52,8 @@ def find_processes() -> Processes:
     names = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
     values = [os.environ.get(name, "") for name in names]
     if not all(value.isdecimal() for value in values):
-        found = ", ".join(f"{name}={value!r}" for name, value in zip(names, values))
-        raise ConfigError(f"several processes need the environment that torchrun sets, found {found}")
+        given = ", ".join(f"{name}={value!r}" for name, value in zip(names, values))
+        raise ConfigError(f"several processes need the environment that torchrun sets, found {given}")
     return Processes(*map(int, values))
 
 

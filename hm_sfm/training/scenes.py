@@ -1,4 +1,4 @@
-"""Training pairs with real parallax: two views of a rendered scene of planar facets that carry photos.
+"""Training pairs with real parallax: two views of a rendered scene of planar facets textured with photos.
 
 Items look like those of photos.WarpedPhotos: every facet has an exact homography between the views, and the map of
 surfaces says which one a pixel of view A shows, where view B shows the same point; occlusion and depth

@@ -29,7 +29,7 @@ class PatchSupervision:
     displacement: Tensor
     """(P, 4, 2) float32 cells: of the four corners."""
     correct: Tensor
-    """(P,) bool: the truth lies within reach; the others are wrong coarse matches."""
+    """(P,) bool: the true point lies within reach; the others are wrong coarse matches."""
 
 
 @dataclass(frozen=True)

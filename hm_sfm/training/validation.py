@@ -1,4 +1,4 @@
-"""The validation set: pairs made of the photos that no training sees, the same ones for everybody.
+"""The validation set: pairs made of the photos that no training sees, the same for everybody.
 
 It is a definition, not a folder of files: every 15th photo of the training folder, one seed, both kinds of pairs.
 """

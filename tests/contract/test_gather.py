@@ -75,10 +75,10 @@ def test_figures_of_images_are_those_of_the_model(run, report):
     assert report.track_lengths == {"this run": {4: 100}}
 
 
-def test_links_are_the_verified_pairs(report):
+def test_the_verified_pairs_are_counted(report):
     assert report.num_pairs == 10
-    assert report.links.keys() == {(i, j) for i in range(5) for j in range(i + 1, 5)} - {(0, 1)}
-    assert set(report.links.values()) == {100}
+    assert report.verified_pairs.keys() == {(i, j) for i in range(5) for j in range(i + 1, 5)} - {(0, 1)}
+    assert set(report.verified_pairs.values()) == {100}
 
 
 def test_weak_pairs_are_drawn_with_their_matches(report):

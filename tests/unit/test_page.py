@@ -12,7 +12,7 @@ import pytest
 from hm_sfm.config import Config
 from hm_sfm.report.diagnosis import Cause, Diagnosis
 from hm_sfm.report.gather import ImageMetrics, Report, Scene, WeakPair
-from hm_sfm.report.page import LABEL_LENGTH, MOST_LINKS, render_page, write_report
+from hm_sfm.report.page import LABEL_LENGTH, MOST_PAIRS, render_page, write_report
 from hm_sfm.types import ImagePair
 
 EVIL = "a</script><b onclick='x'>&\"é .jpg"
@@ -66,7 +66,7 @@ def make_report(names=("a.jpg", "b.jpg", "c.jpg")) -> Report:
         summary=summary,
         images=tuple(images),
         num_pairs=3,
-        links={(0, 1): 400},
+        verified_pairs={(0, 1): 400},
         scene=Scene(rng.normal(size=(50, 3)), rng.integers(0, 255, (50, 3)), rng.normal(size=(2, 5, 3)), names[:2]),
         track_lengths={"this run": {2: 100, 4: 300}, "loftr_style_raw": {2: 50, 3: 50}},
         weak_pairs=(WeakPair(ImagePair(*sorted(names[:2])), 400, b"jpeg"),),
@@ -130,7 +130,7 @@ def test_nothing_was_found():
     report = make_report()
     images = [dataclasses.replace(image, registered=False, mean_error_px=None) for image in report.images]
     summary = {**report.summary, "registered": 0, "models": 0, "points": 0}
-    nothing = {"links": {}, "scene": None, "track_lengths": {"this run": {}}, "weak_pairs": ()}
+    nothing = {"verified_pairs": {}, "scene": None, "track_lengths": {"this run": {}}, "weak_pairs": ()}
     empty = dataclasses.replace(report, summary=summary, images=tuple(images), **nothing)
     text = parse(render_page(empty)).text
     for phrase in ("There is no model", "There are no tracks", "No pair was verified", "0 verified pairs"):
@@ -148,18 +148,18 @@ def test_all_images_registered_leave_no_warning():
 
 
 @pytest.mark.parametrize("count", [20, 120])
-def test_large_graphs_draw_their_strongest_links_and_no_names(count):
+def test_large_graphs_draw_their_strongest_pairs_and_no_names(count):
     image = make_report().images[0]
     images = [dataclasses.replace(image, name=f"some/long/folder/view_{i:03d}.jpg") for i in range(count)]
-    links = {(i, j): 1 + i * count + j for i in range(count) for j in range(i + 1, count)}
-    page = render_page(dataclasses.replace(make_report(), images=tuple(images), links=links))
+    verified_pairs = {(i, j): 1 + i * count + j for i in range(count) for j in range(i + 1, count)}
+    page = render_page(dataclasses.replace(make_report(), images=tuple(images), verified_pairs=verified_pairs))
     graph = re.search(r'<svg class="graph".*?</svg>', page, re.DOTALL).group()
-    assert graph.count("<line ") == min(len(links), MOST_LINKS)
+    assert graph.count("<line ") == min(len(verified_pairs), MOST_PAIRS)
     assert graph.count("<circle ") == count
     labels = re.findall(r"<text .*?>(.*?)</text>", graph)
     assert len(labels) == (count if count == 20 else 0)
     assert all(len(label) == LABEL_LENGTH for label in labels)
-    assert ("weakest are left out" in page) == (len(links) > MOST_LINKS)
+    assert ("weakest are left out" in page) == (len(verified_pairs) > MOST_PAIRS)
 
 
 def test_the_file_appears_whole(tmp_path):

@@ -250,7 +250,7 @@ def _prefix(where: str) -> str:
 
 def _parse_value(value: Any, kind: Any, where: str, dotted: str) -> Any:
     name = f"{_prefix(where)}{dotted}"
-    if dataclasses.is_dataclass(kind):
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         return parse_config(value, kind, where, dotted)
     if get_origin(kind) is Literal:
         check_word(value, get_args(kind), name)
@@ -263,7 +263,7 @@ def _parse_value(value: Any, kind: Any, where: str, dotted: str) -> Any:
         return float(value)
     if type(value) is not kind:
         raise ConfigError(f"{name} must be of type {kind.__name__}, found {value!r}")
-    if kind in (int, float) and not value >= 0:
+    if isinstance(value, int | float) and not value >= 0:
         raise ConfigError(f"{name} must not be negative, found {value!r}")
     return value
 
@@ -337,7 +337,9 @@ def fingerprint(*parts: Any) -> str:
     """16 hex digits that change when any of the parts does (dataclasses, JSON values, paths)."""
 
     def plain(value: Any) -> Any:
-        return dataclasses.asdict(value) if dataclasses.is_dataclass(value) else str(value)
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            return dataclasses.asdict(value)
+        return str(value)
 
     text = json.dumps(parts, default=plain, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

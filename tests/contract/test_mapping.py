@@ -563,8 +563,8 @@ def test_no_pairs_verify_to_nothing():
 
 def test_oracle_matches_through_hlocs_files_give_the_oracles_model(tmp_path, oracle):
     pairs = [found.pair for found in oracle.matches]
-    units = {image.name: 1.0 for image in oracle.images}
-    write_features(tmp_path / "features.h5", oracle.images, oracle.keypoints, units)
+    px_scales = {image.name: 1.0 for image in oracle.images}
+    write_features(tmp_path / "features.h5", oracle.images, oracle.keypoints, px_scales)
     write_matches(tmp_path / "matches.h5", pairs, oracle.keypoints, oracle.matches)
     keypoints = list(read_features(tmp_path / "features.h5", oracle.images))
     matches = list(read_matches(tmp_path / "matches.h5", pairs, keypoints))
@@ -590,8 +590,8 @@ def test_a_pair_with_few_true_matches_among_wrong_ones_is_not_verified():
 
     def verify(doubtful_inlier_ratio: float) -> dict:
         config = VerificationConfig(doubtful_inlier_ratio=doubtful_inlier_ratio)
-        units = dict.fromkeys(cameras, 1.0)
-        return verify_pairs(images, [pair.pair], lambda _: pair, cameras, units, config, quiet=True)
+        px_scales = dict.fromkeys(cameras, 1.0)
+        return verify_pairs(images, [pair.pair], lambda _: pair, cameras, px_scales, config, quiet=True)
 
     assert 30 <= right.sum() <= 50
     assert list(verify(0.25)) == [pair.pair] and not verify(0.6)

@@ -57,14 +57,14 @@ def _walk_greedily(pairs: Sequence[ImagePair], capacity: int) -> list[int]:
     is_open = np.ones(len(pairs), bool)
     pairs_left = np.diff(first)
     is_cached = np.zeros(len(index), bool)
-    links = np.zeros(len(index), np.int64)  # open pairs with cached images, all of which have none among themselves
+    needed = np.zeros(len(index), np.int64)  # open pairs with cached images, which have none among themselves
     weight = int(pairs_left.max()) + 1
     cached: OrderedDict[int, None] = OrderedDict()  # used longest ago first
     order: list[int] = []
 
     def add_links(image: int, step: int) -> None:
         row = slice(first[image], first[image + 1])
-        links[partner[row][is_open[position[row]]]] += step
+        needed[partner[row][is_open[position[row]]]] += step
 
     image = 0
     while True:
@@ -79,7 +79,7 @@ def _walk_greedily(pairs: Sequence[ImagePair], capacity: int) -> list[int]:
         is_open[places] = False
         pairs_left[others] -= 1
         pairs_left[image] -= len(others)
-        links[image] = 0
+        needed[image] = 0
         cached[image] = None
         is_cached[image] = True
         add_links(image, 1)
@@ -89,13 +89,13 @@ def _walk_greedily(pairs: Sequence[ImagePair], capacity: int) -> list[int]:
         if len(cached) == capacity:
             given_up, next_oldest = islice(cached, 2)
             add_links(given_up, -1)
-            if not links.any():  # The next pair is one of the oldest image, which that keeps in the cache.
+            if not needed.any():  # The next pair is one of the oldest image, which that keeps in the cache.
                 add_links(given_up, 1)
                 given_up = next_oldest
                 add_links(given_up, -1)
             del cached[given_up]
             is_cached[given_up] = False
-        if links.any():
-            image = int(np.argmax(links * weight - pairs_left))
+        if needed.any():
+            image = int(np.argmax(needed * weight - pairs_left))
         else:
             image = int(np.argmin(np.where(pairs_left > 0, pairs_left, weight)))

@@ -36,10 +36,10 @@ class Shard:
     @classmethod
     def parse(cls, text: str) -> "Shard":
         """From `number/count`. Raises InputError on anything else."""
-        found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
-        if not found:
+        parts = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
+        if not parts:
             raise InputError(f"a shard is given as number/count, for example 2/8, found {text!r}")
-        return cls(int(found[1]), int(found[2]))
+        return cls(int(parts[1]), int(parts[2]))
 
     def take(self, pairs: Sequence[ImagePair]) -> tuple[ImagePair, ...]:
         """Its pairs, which share photos. All shards together take each pair once."""
@@ -65,8 +65,8 @@ class Shard:
 
 def find_shards(out: Path) -> tuple[Shard, ...]:
     """The shards that OUT holds matches of, finished or not. Raises InputError where they are of different counts."""
-    found = filter(None, (SHARD_NAME.fullmatch(path.name) for path in out.glob("matches.shard-*")))
-    shards = sorted({(int(match[2]), int(match[1])) for match in found})
+    names = filter(None, (SHARD_NAME.fullmatch(path.name) for path in out.glob("matches.shard-*")))
+    shards = sorted({(int(match[2]), int(match[1])) for match in names})
     counts = sorted({count for count, _ in shards})
     if len(counts) > 1:
         raise InputError(

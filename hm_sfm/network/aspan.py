@@ -1,4 +1,4 @@
-"""ASpanFormer's coarse transformer (Chen et al., ECCV 2022, arXiv 2208.14201, section 3): cells look where a flow says.
+"""ASpanFormer's coarse transformer (Chen et al., ECCV 2022, arXiv 2208.14201, section 3): cells attend around a flow.
 
 The flow is a Gaussian for every cell: where in the other image it lies. Each block regresses it anew and lets the cell
 gather from the other image twice: from all of it on a reduced grid, and from a span around the flow, which is as wide
@@ -33,7 +33,7 @@ SPAN_SIGMAS = 5.0
 START_LAYERS = 2
 """Of global attention before the first flow."""
 LEAST_SIGMA = 0.1
-"""Cells; the truth is known to half a cell, so a flow need never be surer."""
+"""Cells; the ground truth is known to half a cell, so a flow need never be surer."""
 WIDEST_SIGMA = 0.25
 """Of a flow that knows nothing yet, relative to the longer side of the other image: its span is all of it."""
 FIRST_GAIN = 0.1
@@ -89,9 +89,7 @@ class FlowStart(nn.Module):
         self.merge = nn.Conv2d(2 * channels, channels, 1)
 
     def forward(self, cells: tuple[Tensor, Tensor], places: tuple[Tensor, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """cells: (B, C, H, W) of both images, places: (B, P, H, W) of both. Returns their cells, and their features of
-        the flow, (B, P, H, W) each.
-        """
+        """Cells (B, C, H, W) and places (B, P, H, W) of both images -> cells, and features of the flow (B, P, H, W)."""
         first, second = (shrink(x, GLOBAL_POOL) for x in cells)
         place0, place1 = (shrink(x, GLOBAL_POOL) for x in places)
         for layer in self.layers:
@@ -106,9 +104,10 @@ class FlowStart(nn.Module):
 
 
 class GlobalLocalBlock(nn.Module):
-    """The global-local attention (GLA): a flow is read from its features, then each cell attends to all of the other
-    image on a reduced grid and to the spans around its flow; a feed-forward network takes in what it found.
+    """The global-local attention (GLA).
 
+    A flow is read from its features, then each cell attends to all of the other image on a reduced grid and to the
+    spans around its flow; a feed-forward network takes in the result.
     keeps_flow: the features of the flow are updated with the cells', for the next block; the last one needs none.
     """
 
@@ -149,8 +148,10 @@ class GlobalLocalBlock(nn.Module):
     def forward(
         self, cells: Tensor, features: Tensor, source: Tensor, source_places: Tensor
     ) -> tuple[Tensor, Tensor, Flow]:
-        """cells: (B, C, H0, W0), features: (B, P, H0, W0) of their flow; source: (B, C, H1, W1), source_places:
-        (B, P, H1, W1). Returns cells, features and the flow that was read from the given features.
+        """Cells, features and the flow that was read from the given features.
+
+        cells: (B, C, H0, W0), features: (B, P, H0, W0) of their flow; source: (B, C, H1, W1), source_places:
+        (B, P, H1, W1).
         """
         flow = self.read_flow(features, source.shape[2:])
         query, key = self.query(cells), self.key(source)
@@ -182,8 +183,9 @@ class SpanTransformer(nn.Module):
             layer.key.load_state_dict(layer.query.state_dict())
 
     def attend(self, map0: Tensor, map1: Tensor) -> tuple[Tensor, Tensor, list[tuple[Flow, Flow]]]:
-        """Maps (B, C, H0, W0), (B, C, H1, W1) float32, with positions added -> both, each aware of the other, and the
-        flow of each block, from image 0 to image 1 and back.
+        """Both maps, each aware of the other, and the flow of each block, from image 0 to image 1 and back.
+
+        map0, map1: (B, C, H0, W0), (B, C, H1, W1) float32, with positions added.
         """
         cells = map0, map1
         places = tuple(
@@ -200,8 +202,10 @@ class SpanTransformer(nn.Module):
 
 
 def attend_globally(query: Tensor, key: Tensor, value: Tensor, heads: int, pool: int) -> Tensor:
-    """What every token of a reduced map gathers from all of another: queries (B, C, H0, W0), keys and values
-    (B, C, H1, W1) -> (B, C, H0, W0); pool: side of the squares of cells that are a token.
+    """What every token of a reduced map gathers from all of another.
+
+    Queries (B, C, H0, W0), keys and values (B, C, H1, W1) -> (B, C, H0, W0); pool: side of the squares of cells that
+    are a token.
     """
     reduced = shrink(query, pool)
     tokens = (_split_heads(shrink(x, pool).flatten(2).transpose(1, 2), heads) for x in (query, key, value))
@@ -237,9 +241,9 @@ def attend_locally(query: Tensor, key: Tensor, value: Tensor, flow: Flow, heads:
 
 
 def place_samples(flow: Flow, pool: int, size_hw: tuple[int, int]) -> Tensor:
-    """Where the spans around a flow are sampled, (B, R, C, SAMPLES**2, 2) float32: x, y, cells of the other image's
-    grid reduced by `pool`, of size size_hw, for each of R x C groups of tokens.
+    """Where the spans around a flow are sampled, (B, R, C, SAMPLES**2, 2) float32, for each of R x C groups of tokens.
 
+    These are x, y, in cells of the other image's grid reduced by `pool`, which has the size size_hw.
     Without gradient, as in the published code: the likelihood alone teaches the flow.
     """
     centre = (shrink(flow.centre.detach(), GROUP * pool) + 0.5) / pool - 0.5
@@ -260,9 +264,10 @@ def measure_spans(log_sigma: Tensor, size_hw: tuple[int, int]) -> Tensor:
 
 
 def find_cells(positions: Tensor, size_hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """The four cells around each of positions (B, R, C, S, 2), x, y in cells of grids of size_hw, and their weights in
-    bilinear interpolation: (B, R, C, S, 4) int64, counted row by row and grid by grid, and float32.
+    """The four cells around each of positions (B, R, C, S, 2), and their weights in bilinear interpolation.
 
+    positions: x, y in cells of grids of size_hw. Returns (B, R, C, S, 4) int64, counted row by row and grid by grid,
+    and (B, R, C, S, 4) float32.
     Beyond its edges a grid goes on as it ends.
     """
     height, width = size_hw
@@ -279,8 +284,9 @@ def find_cells(positions: Tensor, size_hw: tuple[int, int]) -> tuple[Tensor, Ten
 
 
 def shrink(x: Tensor, pool: int) -> Tensor:
-    """Means over squares of `pool` x `pool` cells, (B, C, H, W) -> (B, C, ceil(H / pool), ceil(W / pool)); those at the
-    lower and right edges may be cut off.
+    """Means over squares of `pool` x `pool` cells, (B, C, H, W) -> (B, C, ceil(H / pool), ceil(W / pool)).
+
+    Squares at the lower and right edges may be cut off.
     """
     return x if pool == 1 else F.avg_pool2d(x, pool, ceil_mode=True)
 

@@ -63,10 +63,10 @@ def load_weights(name: str, network: NetworkConfig | None = None) -> HomoNet:
         raise WeightsError(f"{path} is damaged or no hm_sfm weights file: {error}") from error
     wanted = network or made_for
     for field in dataclasses.fields(NetworkConfig):
-        found, asked = getattr(made_for, field.name), getattr(wanted, field.name)
-        if field.name != "iterations" and found != asked:
+        trained, asked = getattr(made_for, field.name), getattr(wanted, field.name)
+        if field.name != "iterations" and trained != asked:
             raise WeightsError(
-                f"{path} was trained with network.{field.name} {found!r}, the configuration has {asked!r}"
+                f"{path} was trained with network.{field.name} {trained!r}, the configuration has {asked!r}"
             )
     net = HomoNet(wanted)
     fit_state(net, state_dict, path)
@@ -74,10 +74,10 @@ def load_weights(name: str, network: NetworkConfig | None = None) -> HomoNet:
 
 
 def load_loftr(net: HomoNet, path: Path) -> None:
-    """Put backbone and coarse stage of a public LoFTR checkpoint into a `loftr` network, by name; the backbone alone where
-    the coarse stage is ASpanFormer's.
+    """Put backbone and coarse stage of a public LoFTR checkpoint into a `loftr` network, by name.
 
-    Raises WeightsError where the file is damaged, or keys are missing or of another shape.
+    Where the network's coarse stage is ASpanFormer's, only the backbone is loaded. Raises WeightsError where the file
+    is damaged, or keys are missing or of another shape.
     """
     content = read_checkpoint(path)
     source = {key.removeprefix("matcher."): value for key, value in content.get("state_dict", content).items()}
@@ -135,17 +135,17 @@ def fit_state(module: nn.Module, state: dict[str, Tensor], path: Path) -> None:
     module.load_state_dict(state, strict=False)  # checked above
 
 
-def describe_misfit(wanted: dict[str, Tensor], found: dict[str, Tensor]) -> str:
-    """Which keys of `found` are missing, unexpected or of another shape, in words; empty where all fit."""
-    if not isinstance(found, dict):
-        return f"it holds a {type(found).__name__} in place of named tensors"
+def describe_misfit(wanted: dict[str, Tensor], state: dict[str, Tensor]) -> str:
+    """Which keys of `state` are missing, unexpected or of another shape, in words; empty where all fit."""
+    if not isinstance(state, dict):
+        return f"it holds a {type(state).__name__} in place of named tensors"
     # Batch norms count their batches, which nothing uses; older files do without.
-    missing = [key for key in wanted if key not in found and not key.endswith("num_batches_tracked")]
-    unexpected = [str(key) for key in found if key not in wanted]
+    missing = [key for key in wanted if key not in state and not key.endswith("num_batches_tracked")]
+    unexpected = [str(key) for key in state if key not in wanted]
     misshapen = [
-        f"{key} ({describe_shape(found[key])}, expected {describe_shape(value)})"
+        f"{key} ({describe_shape(state[key])}, expected {describe_shape(value)})"
         for key, value in wanted.items()
-        if key in found and describe_shape(found[key]) != describe_shape(value)
+        if key in state and describe_shape(state[key]) != describe_shape(value)
     ]
     kinds = {"missing": missing, "unexpected": unexpected, "of another shape": misshapen}
     return "; ".join(f"{kind}: {shorten_list(keys)}" for kind, keys in kinds.items() if keys)
@@ -167,6 +167,6 @@ def shorten_list(names: list[str], most: int = 3) -> str:
 def check_digest(path: Path) -> None:
     """Compare bundled weights with the sha256 beside them. Raises WeightsError where they differ."""
     expected = path.with_suffix(".sha256").read_text().split()[0]
-    found = digest_weights(str(path))
-    if found != expected:
-        raise WeightsError(f"{path} is damaged: its sha256 is {found[:16]}..., expected {expected[:16]}...")
+    digest = digest_weights(str(path))
+    if digest != expected:
+        raise WeightsError(f"{path} is damaged: its sha256 is {digest[:16]}..., expected {expected[:16]}...")

@@ -114,8 +114,10 @@ class AspanCoarse(SpanTransformer):
         return self.log_sharpness.exp()
 
     def describe(self, coarse: Tensor) -> Tensor:
-        """(B, C, H, W) map of the backbone -> (B, C + 2, H, W) float32: features of unit variance with the positions
-        added, and the column and row of each cell, by which `forward` knows the grid.
+        """(B, C, H, W) map of the backbone -> (B, C + 2, H, W) float32.
+
+        These are features of unit variance with the positions added, and the column and row of each cell, by which
+        `forward` knows the grid.
 
         The positions are relative to the image's size, which is what ASpanFormer's normalisation of them is for:
         photos may be larger than those it was trained on.
@@ -128,8 +130,9 @@ class AspanCoarse(SpanTransformer):
         return torch.cat([features, place], dim=1)
 
     def estimate(self, coarse0: Tensor, coarse1: Tensor) -> tuple[Tensor, Tensor, list[tuple[Flow, Flow]]]:
-        """Described cells (B, N0, C + 2), (B, N1, C + 2) -> features (B, N0, C), (B, N1, C), each aware of the other
-        image, and the flow of each block in both directions.
+        """Described cells (B, N0, C + 2), (B, N1, C + 2) -> features (B, N0, C), (B, N1, C), and flows.
+
+        The features of each image are aware of the other one; the flows are those of each block in both directions.
         """
         map0, map1, flows = self.attend(*(as_map(cells) for cells in (coarse0, coarse1)))
         return map0.flatten(2).transpose(1, 2), map1.flatten(2).transpose(1, 2), flows
@@ -139,9 +142,7 @@ class AspanCoarse(SpanTransformer):
         return self.estimate(coarse0, coarse1)[:2]
 
     def match(self, coarse0: Tensor, coarse1: Tensor, threshold: float) -> Matches:
-        """Match described cells (N0, C + 2) and (N1, C + 2), each all of its image: confidence of at least
-        `threshold`.
-        """
+        """Match described cells (N0, C + 2) and (N1, C + 2), all of each image: confidence of at least `threshold`."""
         aware0, aware1 = self(coarse0[None], coarse1[None])
         return match_by_dual_softmax(aware0[0].float(), aware1[0].float(), threshold, self.sharpness)
 

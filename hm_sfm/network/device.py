@@ -6,7 +6,7 @@ from hm_sfm.errors import ConfigError
 
 
 def pick_device(name: str) -> torch.device:
-    """The device `cpu`, `cuda`, or `auto`, which is CUDA where there is one. Raises ConfigError where CUDA is absent."""
+    """The device `cpu`, `cuda`, or `auto`: CUDA where there is one. Raises ConfigError where CUDA is absent."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name == "cuda" and not torch.cuda.is_available():

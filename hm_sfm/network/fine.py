@@ -113,17 +113,17 @@ def make_first_look(index: Tensor, radius: int, pooling: Tensor) -> Tensor:
     """(N, S * S + 1, 2 * (2 * radius + 1)**2) float32: times maps of layout sample_windows, what lies around `index`.
 
     index: (N, 2) map indices, the same ones in all maps; the samples are those of the maps, then those of the pooled
-    ones, see make_pooling. Nothing has moved yet at the first update: where it looks is known before, and one small
+    ones, see make_pooling. Nothing has moved yet at the first update: where it samples is known before, and one small
     matrix product takes a third of the time of two sample_windows.
     """
     maps = torch.eye(len(pooling))[:, None]  # one that holds a single 1 at each cell: samples are linear in the maps
     pooled = maps @ pooling
     centres = index[:, None, None].expand(-1, len(maps), -1, -1)
-    looks = [
+    parts = [
         torch.cat([sample_windows(maps, full, radius), sample_windows(pooled, (full - 0.5) / 2, radius)]).T
         for full in centres
     ]
-    return torch.stack(looks)
+    return torch.stack(parts)
 
 
 def convolve(maps: Tensor, layer: nn.Conv2d) -> Tensor:
@@ -215,7 +215,7 @@ class HomographyHead(nn.Module):
         return estimates
 
     def look_up(self, full: Tensor, pooled: Tensor, target: Tensor) -> Tensor:
-        """The correlations around `target` (P, N, 2): (P, N, 2 * (2 * radius + 1)**2), those of the pooled maps last."""
+        """The correlations around `target` (P, N, 2): (P, N, 2 (2 radius + 1)**2), those of the pooled maps last."""
         index = target + self.half + self.margin
         samples = torch.cat(
             [sample_windows(full, index, self.radius), sample_windows(pooled, (index - 0.5) / 2, self.radius)]

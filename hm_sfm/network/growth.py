@@ -2,7 +2,7 @@
 
 The coarse stage compares cells one by one and misses many where views differ: repeated or weak texture, other scales
 and angles. A neighbour's homography predicts both place and shape of such a patch, so the fine stage can start there.
-Only what it then finds good is kept, and grows further: a wrong match has no neighbours that agree with it.
+Only estimates that turn out good are kept, and grow further: a wrong match has no neighbours that agree with it.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from hm_sfm.network.homography import apply_homography, is_regular, make_corners
 
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
 
-Refine = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+Estimate = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 """cell0, cell1 (P, 2) int64 fine cells and start (P, 4, 2) displacements -> homography (P, 3, 3), log_scale (P,)."""
 
 
@@ -52,26 +52,26 @@ class GridMatches:
 
 
 def grow_matches(
-    found: GridMatches, grid: PatchGrid, refine: Refine, size1_wh: tuple[int, int], good: float, rounds: int
+    matches: GridMatches, grid: PatchGrid, estimate: Estimate, size1_wh: tuple[int, int], good: float, rounds: int
 ) -> GridMatches:
     """Spread good matches (log_scale below `good`) to the neighbouring cells that have none, `rounds` times.
 
     size1_wh: cells of image 1's fine map. Of several good neighbours the best one predicts. Returns the matches of all
-    cells that have one, found or grown, by cell; a found one that is not good gives way to a better one.
+    cells that have one, given or grown, by cell; a given one that is not good gives way to a better one.
     """
-    count, device = grid.columns * grid.rows, found.index0.device
+    count, device = grid.columns * grid.rows, matches.index0.device
     log_scale = torch.full((count,), torch.inf, device=device)
     homography = torch.zeros(count, 3, 3, device=device)
     cell1 = torch.zeros(count, 2, dtype=torch.int64, device=device)
 
-    def put(index: Tensor, matches: GridMatches, chosen: Tensor) -> None:
+    def put(index: Tensor, these: GridMatches, chosen: Tensor) -> None:
         log_scale[index], homography[index], cell1[index] = (
-            matches.log_scale[chosen], matches.homography[chosen], matches.cell1[chosen],
+            these.log_scale[chosen], these.homography[chosen], these.cell1[chosen],
         )  # fmt: skip
 
-    put(found.index0, found, torch.arange(len(found.index0), device=device))
-    usable = is_regular(found.homography, grid.half) & (found.log_scale < good)
-    fresh = found.index0[usable]
+    put(matches.index0, matches, torch.arange(len(matches.index0), device=device))
+    usable = is_regular(matches.homography, grid.half) & (matches.log_scale < good)
+    fresh = matches.index0[usable]
     corners = make_corners(grid.half, device)
     for _ in range(rounds):
         target, source, step = find_neighbours(fresh, log_scale, grid, good)
@@ -83,7 +83,7 @@ def grow_matches(
         if not len(target):
             break
         start = moved + (cell1[source] - place)[:, None] - corners
-        grown = GridMatches(target, place, *refine(grid.to_fine(target), place, start))
+        grown = GridMatches(target, place, *estimate(grid.to_fine(target), place, start))
         better = is_regular(grown.homography, grid.half) & (grown.log_scale < log_scale[target].clamp_max(good))
         put(target[better], grown, better)
         fresh = target[better]

@@ -90,9 +90,7 @@ class CoarseTransformer(nn.Module):
                 nn.init.xavier_uniform_(parameter)
 
     def forward(self, coarse0: Tensor, coarse1: Tensor, first_layer: int = 0) -> tuple[Tensor, Tensor]:
-        """coarse0: (B, N0, C), coarse1: (B, N1, C), after the layers before `first_layer`. Returns both, each aware of
-        the other.
-        """
+        """Cells (B, N0, C) and (B, N1, C), after the layers before `first_layer` -> both, each aware of the other."""
         for number, layer in enumerate(self.layers[first_layer:], start=first_layer):
             if number % 2:
                 coarse0 = layer(coarse0, coarse1)

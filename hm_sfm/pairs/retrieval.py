@@ -1,4 +1,4 @@
-"""Which photos look alike: a global descriptor per photo, from the network's plain coarse features.
+"""Which photos are similar in appearance: a global descriptor per photo, from the network's plain coarse features.
 
 Each photo is encoded once, at a small size, and a sample of its cells is kept on disk. In seconds the descriptors are
 made of these samples: bags of visual words (Sivic and Zisserman, ICCV 2003), of a vocabulary learned from the
@@ -101,20 +101,20 @@ def describe_images(
     encode: EncodeCells,
     store: CellStore,
     quiet: bool = False,
-    turned: bool = False,
+    rotated: bool = False,
 ) -> np.ndarray:
     """Global descriptors (N, D) float32 of unit length, none of it negative, in the order of the images.
 
-    digests: of the photos, by name. turned: as they are and turned clockwise, by each of ROTATIONS_DEG, (T, N, D): the words
-    are then those of all turns. Photos that the store lacks are encoded into it, in batches. Raises InputError on an
-    undecodable photo; what was stored by then stays.
+    digests: of the photos, by name. rotated: as they are and rotated clockwise, by each of ROTATIONS_DEG, (T, N, D);
+    the words are then those of all rotations. Photos that the store lacks are encoded into it, in batches. Raises
+    InputError on an undecodable photo; what was stored by then stays.
     """
-    turns_deg = ROTATIONS_DEG if turned else (0,)
-    encode_images(images, digests, encode, store, quiet, turns_deg)
-    keys = [name_sample(digests[image.name], rotation_deg) for rotation_deg in turns_deg for image in images]
+    rotations_deg = ROTATIONS_DEG if rotated else (0,)
+    encode_images(images, digests, encode, store, quiet, rotations_deg)
+    keys = [name_sample(digests[image.name], rotation_deg) for rotation_deg in rotations_deg for image in images]
     vocabulary = learn_vocabulary(store.read(keys, max(1, VOCABULARY_CELLS // len(keys))))
     described = weigh_words(np.stack([count_words(cells, vocabulary) for cells in store.read(keys)]))
-    return described.reshape(len(turns_deg), len(images), -1) if turned else described
+    return described.reshape(len(rotations_deg), len(images), -1) if rotated else described
 
 
 def encode_images(
@@ -123,18 +123,18 @@ def encode_images(
     encode: EncodeCells,
     store: CellStore,
     quiet: bool = False,
-    turns_deg: Sequence[int] = (0,),
+    rotations_deg: Sequence[int] = (0,),
 ) -> None:
-    """Put a sample of the cells of each photo, turned clockwise by each angle, into the store, unless it is there."""
+    """Put a sample of the cells of each photo, rotated clockwise by each angle, into the store, unless it is there."""
     missing = {
         digests[image.name]: image
         for image in images
-        if any(name_sample(digests[image.name], rotation_deg) not in store for rotation_deg in turns_deg)
+        if any(name_sample(digests[image.name], rotation_deg) not in store for rotation_deg in rotations_deg)
     }
     with store_in_batches(lambda batch: store.write(dict(batch))) as keep:
         for digest, image in tqdm(missing.items(), desc="retrieval", unit="image", disable=quiet or not missing):
             prepared = prepare_image(image, LONG_EDGE_PX)
-            for rotation_deg in turns_deg:
+            for rotation_deg in rotations_deg:
                 key = name_sample(digest, rotation_deg)
                 if key not in store:
                     cells = encode(apply_hypothesis(prepared, Hypothesis(rotation_deg)))
@@ -142,7 +142,7 @@ def encode_images(
 
 
 def name_sample(digest: str, rotation_deg: int) -> str:
-    """The name in a CellStore of the sample of a turned photo; that of the photo as it is has its digest."""
+    """The name in a CellStore of the sample of a rotated photo; that of the photo as it is has its digest."""
     return f"{digest}-{rotation_deg}" if rotation_deg else digest
 
 
@@ -183,18 +183,18 @@ def find_similar(descriptors: np.ndarray, top: int, gap: int = 0) -> np.ndarray:
     compared with the others in all ways, of which the most similar one counts. Returns (N, top) int64 rows, -1 where no
     more have anything in common with it. Of equally similar ones the lower row comes first.
     """
-    turned = descriptors[1:] if descriptors.ndim == 3 else []
+    rotated = descriptors[1:] if descriptors.ndim == 3 else []
     descriptors = descriptors[0] if descriptors.ndim == 3 else descriptors
     count = len(descriptors)
-    found = np.full((count, top), -1, np.int64)
+    similar = np.full((count, top), -1, np.int64)
     for start in range(0, count, BLOCK_ROWS):
         block = descriptors[start : start + BLOCK_ROWS]
         similarity = block @ descriptors.T
-        for others in turned:
+        for others in rotated:
             np.maximum(similarity, block @ others.T, out=similarity)
         rows = np.arange(start, start + len(similarity))
         similarity[np.abs(rows[:, None] - np.arange(count)) <= gap] = 0
         best = np.argsort(-similarity, axis=1, kind="stable")[:, :top]
         is_similar = np.take_along_axis(similarity, best, axis=1) > 0
-        found[rows, : best.shape[1]] = np.where(is_similar, best, -1)
-    return found
+        similar[rows, : best.shape[1]] = np.where(is_similar, best, -1)
+    return similar

@@ -41,7 +41,7 @@ def select_pairs(
     it, those taken nearest to it, and, where the images are a sequence, its followers: where their names are numbered
     and most of the next ones are alike. Images without position have no neighbours by position.
 
-    find_similar: asked only where the mode needs to know which images look alike.
+    find_similar: called only where the mode needs to know which images are similar in appearance.
 
     Raises InputError where there are fewer than two images, no pair at all, no positions for the mode spatial, or the
     pairs file is unusable, ConfigError where the mode or a setting is impossible, ValueError where the mode needs
@@ -108,14 +108,17 @@ def pair_spatially(positions: Mapping[str, Position], top: int, distance_m: floa
     positions: latitude and longitude in degrees (WGS84) and altitude in m, which is ignored, by image name.
     """
     names = sorted(positions)
-    with tempfile.TemporaryDirectory() as folder, quiet_colmap():
-        with pycolmap.Database.open(Path(folder) / "positions.db") as database:
-            _write_positions(database, names, positions)
-            options = pycolmap.SpatialPairingOptions(
-                max_num_neighbors=top, max_distance=distance_m, ignore_z=True, num_threads=1
-            )
-            found = pycolmap.SpatialPairGenerator(options, database).all_pairs()
-    return tuple(dict.fromkeys(ImagePair.of(names[a - 1], names[b - 1]) for a, b in sorted(found)))
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        quiet_colmap(),
+        pycolmap.Database.open(Path(folder) / "positions.db") as database,
+    ):
+        _write_positions(database, names, positions)
+        options = pycolmap.SpatialPairingOptions(
+            max_num_neighbors=top, max_distance=distance_m, ignore_z=True, num_threads=1
+        )
+        neighbours = pycolmap.SpatialPairGenerator(options, database).all_pairs()
+    return tuple(dict.fromkeys(ImagePair.of(names[a - 1], names[b - 1]) for a, b in sorted(neighbours)))
 
 
 def _pair_at_distances(ordered: Sequence[str], distances: Iterable[int]) -> tuple[ImagePair, ...]:
@@ -133,11 +136,11 @@ def _pair_similar(
 ) -> tuple[ImagePair, ...]:
     """Each image with the `top` ones most like it: a pair that one of the two proposes is enough."""
     if find_similar is None:
-        raise ValueError(f"to pair {len(ordered)} images by their looks, select_pairs needs find_similar")
-    found = find_similar(ordered, min(top, len(ordered) - 1), gap)
+        raise ValueError(f"to pair {len(ordered)} images by appearance, select_pairs needs find_similar")
+    similar = find_similar(ordered, min(top, len(ordered) - 1), gap)
     return tuple(
         dict.fromkeys(
-            ImagePair.of(ordered[i], ordered[j]) for i, row in enumerate(found.tolist()) for j in row if j >= 0
+            ImagePair.of(ordered[i], ordered[j]) for i, row in enumerate(similar.tolist()) for j in row if j >= 0
         )
     )
 

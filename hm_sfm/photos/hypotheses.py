@@ -1,4 +1,4 @@
-"""Prepared photos, turned and reduced: the rotation and scale hypotheses under which photos are encoded."""
+"""Prepared photos, rotated and reduced: the rotation and scale hypotheses under which photos are encoded."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ ROTATIONS_DEG = (0, *CV_ROTATIONS)
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """How a prepared photo is turned and reduced before it is encoded."""
+    """How a prepared photo is rotated and reduced before it is encoded."""
 
     rotation_deg: int = 0
     """Clockwise: 0, 90, 180 or 270."""
@@ -26,7 +26,7 @@ IDENTITY = Hypothesis()
 
 
 def apply_hypothesis(image: PreparedImage, hypothesis: Hypothesis) -> PreparedImage:
-    """The image turned and reduced; its points map back to px of the same stored photo."""
+    """The image rotated and reduced; its points map back to px of the same stored photo."""
     if hypothesis == IDENTITY:
         return image
     width, height = image.scaled_wh

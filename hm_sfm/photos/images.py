@@ -1,7 +1,7 @@
 """Stage 1: the photos of a folder, and one photo made ready for the network: grey, upright, reduced.
 
 Photos are read as COLMAP reads them, unrotated. Where EXIF says that a photo is turned it is turned for matching,
-and `PreparedImage.stored_from_scaled` carries the points back. HEIC, which COLMAP cannot read, is upright when decoded.
+and `PreparedImage.stored_from_scaled` maps the points back. HEIC, which COLMAP cannot read, is upright when decoded.
 """
 
 import logging
@@ -134,10 +134,10 @@ def read_ref(path: Path, name: str | None = None) -> ImageRef:
 
 def _read_gps(bitmap: pycolmap.Bitmap) -> tuple[float, float, float] | None:
     """ImageRef.gps; None unless EXIF has all of it, as COLMAP does, and where receivers without a fix left zeros."""
-    found = (bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude())
-    if None in found or not np.isfinite(found).all() or found[:2] == (0, 0):
+    position = (bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude())
+    if None in position or not np.isfinite(position).all() or position[:2] == (0, 0):
         return None
-    return found if abs(found[0]) <= 90 and abs(found[1]) <= 180 else None
+    return position if abs(position[0]) <= 90 and abs(position[1]) <= 180 else None
 
 
 def prepare_image(ref: ImageRef, long_edge_px: int) -> PreparedImage:
@@ -157,10 +157,11 @@ def prepare_image(ref: ImageRef, long_edge_px: int) -> PreparedImage:
         grey = None if bitmap is None else bitmap.to_array().reshape(bitmap.height, bitmap.width)
     if grey is None:
         raise InputError(f"{ref.path} cannot be decoded as an image")
-    found_wh = (grey.shape[1], grey.shape[0])
-    if found_wh != tuple(ref.size_wh):
+    decoded_wh = (grey.shape[1], grey.shape[0])
+    if decoded_wh != tuple(ref.size_wh):
         raise InputError(
-            f"{ref.path} is {found_wh[0]} x {found_wh[1]} px but was listed as {ref.size_wh[0]} x {ref.size_wh[1]} px"
+            f"{ref.path} is {decoded_wh[0]} x {decoded_wh[1]} px but was listed as "
+            f"{ref.size_wh[0]} x {ref.size_wh[1]} px"
         )
     return _prepare(ref, grey, long_edge_px)
 

@@ -136,18 +136,21 @@ def count_frames(path: Path, quiet: bool) -> Iterator[tuple[int, np.ndarray]]:
     """read_frames with a progress bar; a video that ends early is logged as a warning."""
     with open_video(path) as video:
         expected = max(int(video.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
-    found = 0
+    decoded = 0
     with tqdm(total=expected or None, desc=path.name, unit="frame", disable=quiet) as progress:
-        for found, frame in enumerate(read_frames(path), start=1):
+        for frame in read_frames(path):
             yield frame
+            decoded += 1
             progress.update()
-    if found < (1 - LOST_SHARE) * expected:
-        logger.warning("%s is damaged: %d of its %d frames could be decoded", path, found, expected)
+    if decoded < (1 - LOST_SHARE) * expected:
+        logger.warning("%s is damaged: %d of its %d frames could be decoded", path, decoded, expected)
 
 
 def read_frames(path: Path) -> Iterator[tuple[int, np.ndarray]]:
-    """Every frame of a video that can be decoded, in order: milliseconds from the start, which never fall, and the
-    (H, W, 3) uint8 BGR pixels, turned upright as the video says.
+    """Every frame of a video that can be decoded, in order.
+
+    Gives milliseconds from the start, which never fall, and the (H, W, 3) uint8 BGR pixels, rotated upright as the
+    video says.
     """
     milliseconds = 0
     with open_video(path) as video:

@@ -185,7 +185,7 @@ def test_modes(tmp_path):
     with pytest.raises(InputError, match="'sequental' is neither auto, exhaustive, .* or spatial nor a file"):
         select_pairs(names, PairConfig(mode="sequental"))
     for mode in ("retrieval", "auto"):
-        with pytest.raises(ValueError, match="pair 100 images by their looks, select_pairs needs find_similar"):
+        with pytest.raises(ValueError, match="pair 100 images by appearance, select_pairs needs find_similar"):
             select_pairs(names, PairConfig(mode=mode))
 
 

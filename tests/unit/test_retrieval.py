@@ -225,7 +225,7 @@ def test_turned_photos_are_found(tmp_path):
     images = [read_ref(tmp_path / f"{i}.png") for i in range(8)]
     digests, store = {image.name: image.name for image in images}, CellStore(tmp_path / "cells", "a")
     upright = describe_images(images, digests, matcher.encoder.encode_plain, store, quiet=True)
-    turned = describe_images(images, digests, matcher.encoder.encode_plain, store, quiet=True, turned=True)
+    turned = describe_images(images, digests, matcher.encoder.encode_plain, store, quiet=True, rotated=True)
     assert turned.shape[:2] == (4, 8) and turned.dtype == np.float32
     expected = [4, 5, 6, 7, 0, 1, 2, 3]
     assert find_similar(turned, 1).ravel().tolist() == expected != find_similar(upright, 1).ravel().tolist()

@@ -16,6 +16,7 @@ import numpy as np
 
 from hm_sfm.errors import InputError
 from hm_sfm.geometry.frames import pixel_index_from_px, px_from_pixel_index
+from hm_sfm.io.arrays import open_group, read_array, read_attributes
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
@@ -86,25 +87,27 @@ def read_features(path: Path, images: Sequence[ImageRef]) -> tuple[Keypoints, ..
         return tuple(read_keypoints(h5[image.name], path, image) for image in images)
 
 
-def read_keypoints(group: h5py.Group, path: Path, image: ImageRef) -> Keypoints:
+def read_keypoints(group: object, path: Path, image: ImageRef) -> Keypoints:
     """The keypoints of one image. Raises InputError as read_features does."""
     if not isinstance(group, h5py.Group) or not isinstance(group.get("keypoints"), h5py.Dataset):
         raise InputError(f"{path} has no keypoints in its group {image.name!r}: expected a features file of hloc")
-    data = group["keypoints"]
+    data = read_array(group, "keypoints")
     if data.ndim != 2 or data.shape[1] != 2:
         raise InputError(f"the keypoints of {image.name!r} in {path} must have shape (K, 2), found {data.shape}")
-    if "image_size" in group and tuple(map(int, group["image_size"])) != tuple(image.size_wh):
-        width, height = map(int, group["image_size"])
+    size_wh = tuple(map(int, read_array(group, "image_size"))) if "image_size" in group else image.size_wh
+    if size_wh != tuple(image.size_wh):
+        width, height = size_wh
         raise InputError(
             f"{path} has the keypoints of an image {image.name!r} of {width} x {height} px, the photo has "
             f"{image.size_wh[0]} x {image.size_wh[1]} px: it is of other photos, or of photos rotated as EXIF says"
         )
-    xy = px_from_pixel_index(data[()].astype(np.float32))
+    xy = px_from_pixel_index(data.astype(np.float32))
     # Half precision rounds to whole pixels from 1024 on: a point at the edge may come to lie a bit outside.
     if not np.all((xy >= -1) & (xy <= np.array(image.size_wh) + 1)):
         raise InputError(f"{path} has keypoints outside of {image.name!r}: it is of other photos")
-    sigma = group["sigma_px"][()] if "sigma_px" in group else np.full(len(xy), data.attrs.get("uncertainty", 1.0))
-    score = next((group[name][()] for name in ("scores", "score") if name in group), np.ones(len(xy)))
+    uncertainty = read_attributes(group["keypoints"]).get("uncertainty", 1.0)
+    sigma = read_array(group, "sigma_px") if "sigma_px" in group else np.full(len(xy), uncertainty)
+    score = next((read_array(group, name) for name in ("scores", "score") if name in group), np.ones(len(xy)))
     if not sigma.shape == score.shape == (len(xy),):
         raise InputError(f"{path} has {len(xy)} keypoints of {image.name!r} but scores of shape {score.shape}")
     return Keypoints(image.name, xy, sigma, score)
@@ -134,7 +137,7 @@ def find_group(h5: h5py.File, pair: ImagePair, dataset: str = "matches0") -> tup
     for separator in SEPARATORS:
         for swapped, names in ((False, (pair.name0, pair.name1)), (True, (pair.name1, pair.name0))):
             group = name_group(*names, separator)
-            if group in h5 and dataset in h5[group]:
+            if group in h5 and dataset in open_group(h5, group):
                 return group, swapped
     return None
 
@@ -143,8 +146,9 @@ def read_pair(
     h5: h5py.File, path: Path, pair: ImagePair, group: str, swapped: bool, count_of: Mapping[str, int]
 ) -> IndexMatches:
     """The matches of one pair. Raises InputError as read_matches does."""
-    partner = h5[group]["matches0"][()].astype(np.int64)
-    score = h5[group]["matching_scores0"][()] if "matching_scores0" in h5[group] else np.ones(len(partner))
+    data = open_group(h5, group)
+    partner = read_array(data, "matches0").astype(np.int64)
+    score = read_array(data, "matching_scores0") if "matching_scores0" in data else np.ones(len(partner))
     if partner.ndim != 1 or partner.shape != score.shape:
         raise InputError(f"{path} has {partner.shape} matches but {score.shape} scores in its group {group!r}")
     first = np.flatnonzero(partner >= 0)

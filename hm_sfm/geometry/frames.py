@@ -5,11 +5,11 @@ then a pure scaling. OpenCV and most CNN code put the centre of the top-left pix
 """
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-Array = TypeVar("Array")  # numpy array or torch tensor
+Array = TypeVar("Array", bound=Any)  # numpy array or torch tensor
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,8 @@ class Encoder:
     def __init__(self, net: HomoNet, device: torch.device) -> None:
         self.device = device
         self.net = net.to(device).eval().requires_grad_(False)
-        self.net.backbone.to(memory_format=torch.channels_last)  # half the time on a CPU
+        # Half the time on a CPU. PyTorch's own type hints lack this argument of a module.
+        self.net.backbone.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     @torch.inference_mode()
     def encode(self, image: PreparedImage) -> ImageFeatures:
@@ -36,7 +37,7 @@ class Encoder:
         return ImageFeatures(
             coarse=coarse.flatten(0, 1),
             cell=torch.stack([x, y], dim=-1).reshape(-1, 2).to(self.device),
-            fine=make_fine_map(maps.fine),
+            fine=make_fine_map(require_fine(maps)),
             scaled_wh=image.scaled_wh,
             stored_from_scaled=image.stored_from_scaled,
             image=image.ref,
@@ -62,7 +63,7 @@ class Encoder:
         strips = []
         for top in range(0, height, STRIP_PX):
             first, last = max(0, top - MARGIN_PX), min(height, top + STRIP_PX + MARGIN_PX)
-            fine = self._run_backbone(pixels[:, :, first:last]).fine
+            fine = require_fine(self._run_backbone(pixels[:, :, first:last]))
             bottom = min(height, top + STRIP_PX)
             strips.append(fine[:, :, (top - first) // stride : (bottom - first) // stride])
         return make_fine_map(torch.cat(strips, dim=2))
@@ -86,6 +87,12 @@ class Encoder:
         """Columns and rows of the coarse cells whose centre lies within the image."""
         columns, rows = (self.net.backbone.coarse_grid.count_cells(size) for size in image.scaled_wh)
         return columns, rows
+
+
+def require_fine(maps: FeatureMaps) -> Tensor:
+    """(B, C, H, W): the fine features of maps that were asked for them."""
+    assert maps.fine is not None
+    return maps.fine
 
 
 def pad_image(grey: Tensor, stride: int, standardise: bool) -> Tensor:

@@ -110,9 +110,9 @@ class HomoMatcher:
             head, features0.fine, features1.fine, cell0.to(self.device), cell1.to(self.device), start
         )
         good = scale_from_score(GROWING_SCORE, grid)
-        can_grow = isinstance(head, HomographyHead) and points.index0 is not None
-        if can_grow and torch.count_nonzero(patches.log_scale < good) < self.config.grow_below:
-            patches = self._grow(features0, features1, points.index0, patches, good)
+        index0 = points.index0 if isinstance(head, HomographyHead) else None
+        if index0 is not None and torch.count_nonzero(patches.log_scale < good) < self.config.grow_below:
+            patches = self._grow(features0, features1, index0, patches, good)
             offset0 = np.zeros((len(patches.cell0), 2))
         stored = locate_patches(
             patches, offset0, features0.stored_from_scaled, features1.stored_from_scaled, grid, head.half

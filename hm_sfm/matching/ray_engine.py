@@ -6,6 +6,7 @@ with one thread, byte for byte, on processors of one kind. More threads add up i
 without half precision round otherwise: at least 98 of 100 matches are then found again within 0.1 px.
 """
 
+import logging
 import os
 import time
 from collections import deque
@@ -70,7 +71,7 @@ def match_on_cluster(
         connected_here = not ray.is_initialized()
         if connected_here:
             os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-            ray.init(include_dashboard=False, log_to_driver=False, logging_level="error")
+            ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
         try:
             images = [replace(image, path=image.path.absolute()) for image in images]
             with tqdm(

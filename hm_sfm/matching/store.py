@@ -21,6 +21,7 @@ import numpy as np
 
 from hm_sfm.config import Config
 from hm_sfm.errors import InputError, StaleResultError
+from hm_sfm.io.arrays import open_group, read_array, read_attributes
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
@@ -89,14 +90,14 @@ class MatchStore:
         """The matches of one pair. Raises KeyError where they were never stored."""
         file, group = self._where[pair]
         with h5py.File(file, "r") as h5:
-            data = h5[group]
+            data = open_group(h5, group)
             return PairMatches(
                 pair=pair,
-                xy0=data["xy0"][()],
-                xy1=data["xy1"][()],
-                score=data["score"][()],
-                homography=data["homography"][()],
-                patch_radius_px=float(data.attrs["patch_radius_px"]),
+                xy0=read_array(data, "xy0"),
+                xy1=read_array(data, "xy1"),
+                score=read_array(data, "score"),
+                homography=read_array(data, "homography"),
+                patch_radius_px=float(read_attributes(data)["patch_radius_px"]),
             )
 
     def write(self, batch: Sequence[PairMatches]) -> None:
@@ -171,13 +172,14 @@ class MatchStore:
     def _index(self, file: Path) -> None:
         try:
             with h5py.File(file, "r") as h5:
-                if h5.attrs.get("version") != VERSION:
+                stamp = read_attributes(h5)
+                if stamp.get("version") != VERSION:
                     raise StaleResultError(f"{file} is of another version of hm_sfm: name another OUT or delete it")
-                self._compare_settings(file, json.loads(h5.attrs["made_by"]))
-                if not set(h5.attrs["images"].split()) & set(self.digests.values()):
+                self._compare_settings(file, json.loads(stamp["made_by"]))
+                if not set(stamp["images"].split()) & set(self.digests.values()):
                     raise StaleResultError(f"{file} was made from other photos: name another OUT or delete it")
                 for group, data in h5.items():
-                    attrs = data.attrs
+                    attrs = read_attributes(data)
                     same = all(self.digests.get(attrs[f"name{i}"]) == attrs[f"digest{i}"] for i in (0, 1))
                     if same:
                         self._where[ImagePair(attrs["name0"], attrs["name1"])] = (file, group)

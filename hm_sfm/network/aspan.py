@@ -9,6 +9,7 @@ The parameters have names of our own. Ours, too, are the starting values: messag
 so that a new network begins near the plain features, and a short training gets somewhere.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -53,8 +54,8 @@ class Flow:
 class ChannelNorm(nn.LayerNorm):
     """Layer norm over the channels of a map (B, C, H, W)."""
 
-    def forward(self, x: Tensor) -> Tensor:
-        return super().forward(x.movedim(1, -1)).movedim(-1, 1)
+    def forward(self, input: Tensor) -> Tensor:
+        return super().forward(input.movedim(1, -1)).movedim(-1, 1)
 
 
 class GlobalLayer(nn.Module):
@@ -132,7 +133,7 @@ class GlobalLocalBlock(nn.Module):
         )
         self.norm2 = make_small(ChannelNorm(updated))
 
-    def read_flow(self, features: Tensor, size_hw: tuple[int, int]) -> Flow:
+    def read_flow(self, features: Tensor, size_hw: Sequence[int]) -> Flow:
         """The flow that features (B, P, H, W) of it stand for; size_hw: of the other image's grid.
 
         Relative to its longer side, as the positions are, so that both mean the same in images of any shape.
@@ -179,8 +180,9 @@ class SpanTransformer(nn.Module):
         for name, parameter in self.named_parameters():
             if parameter.dim() > 1 and not name.endswith("key.weight"):
                 nn.init.xavier_uniform_(parameter, FIRST_GAIN if name == "start.merge.weight" else 1.0)
-        for layer in (*self.start.layers, *self.blocks):
-            layer.key.load_state_dict(layer.query.state_dict())
+        for layer in self.modules():
+            if isinstance(layer, GlobalLayer | GlobalLocalBlock):
+                layer.key.load_state_dict(layer.query.state_dict())
 
     def attend(self, map0: Tensor, map1: Tensor) -> tuple[Tensor, Tensor, list[tuple[Flow, Flow]]]:
         """Both maps, each aware of the other, and the flow of each block, from image 0 to image 1 and back.
@@ -189,7 +191,9 @@ class SpanTransformer(nn.Module):
         """
         cells = map0, map1
         places = tuple(
-            self.place(place_positions(self.channels, *x.shape[2:], x.device)[None]).expand(len(x), -1, -1, -1)
+            self.place(place_positions(self.channels, x.shape[2], x.shape[3], x.device)[None]).expand(
+                len(x), -1, -1, -1
+            )
             for x in cells
         )
         cells, features = self.start(cells, places)
@@ -208,8 +212,10 @@ def attend_globally(query: Tensor, key: Tensor, value: Tensor, heads: int, pool:
     are a token.
     """
     reduced = shrink(query, pool)
-    tokens = (_split_heads(shrink(x, pool).flatten(2).transpose(1, 2), heads) for x in (query, key, value))
-    message = F.scaled_dot_product_attention(*tokens)
+    queries, keys, values = (
+        _split_heads(shrink(x, pool).flatten(2).transpose(1, 2), heads) for x in (query, key, value)
+    )
+    message = F.scaled_dot_product_attention(queries, keys, values)
     message = message.transpose(2, 3).reshape(len(query), -1, *reduced.shape[2:])
     return enlarge(message, pool, query.shape[2:])
 
@@ -232,15 +238,16 @@ def attend_locally(query: Tensor, key: Tensor, value: Tensor, flow: Flow, heads:
     for own, seen, share in zip(*(x.split(GROUP_CHUNK) for x in (grouped, index, weight))):
         # A sum of four rows of a table: on a CPU faster than grid_sample, above all on the way back.
         samples = F.embedding_bag(seen.flatten(0, 1), cells, mode="sum", per_sample_weights=share.flatten(0, 1))
-        samples = samples.unflatten(0, (-1, SAMPLES**2)).chunk(2, dim=2)
-        messages.append(F.scaled_dot_product_attention(*(_split_heads(x, heads) for x in (own, *samples))))
+        keys, values = samples.unflatten(0, (-1, SAMPLES**2)).chunk(2, dim=2)
+        queries, keys, values = (_split_heads(x, heads) for x in (own, keys, values))
+        messages.append(F.scaled_dot_product_attention(queries, keys, values))
     message = torch.cat(messages)
     message = message.transpose(1, 2).reshape(batch, rows, columns, GROUP, GROUP, channels)
     message = message.permute(0, 5, 1, 3, 2, 4).reshape(batch, channels, rows * GROUP, columns * GROUP)
     return enlarge(message[:, :, :height, :width], pool, size_hw)
 
 
-def place_samples(flow: Flow, pool: int, size_hw: tuple[int, int]) -> Tensor:
+def place_samples(flow: Flow, pool: int, size_hw: Sequence[int]) -> Tensor:
     """Where the spans around a flow are sampled, (B, R, C, SAMPLES**2, 2) float32, for each of R x C groups of tokens.
 
     These are x, y, in cells of the other image's grid reduced by `pool`, which has the size size_hw.
@@ -253,7 +260,7 @@ def place_samples(flow: Flow, pool: int, size_hw: tuple[int, int]) -> Tensor:
     return centre.permute(0, 2, 3, 1)[..., None, :] + offset * span.permute(0, 2, 3, 1)[..., None, :]
 
 
-def measure_spans(log_sigma: Tensor, size_hw: tuple[int, int]) -> Tensor:
+def measure_spans(log_sigma: Tensor, size_hw: Sequence[int]) -> Tensor:
     """Sides of the spans of flows with standard deviations log_sigma (B, 2, H, W), log cells: (B, 2, H, W).
 
     From SAMPLES, where samples are neighbouring tokens, to the size of the other grid, size_hw. As in the published
@@ -263,7 +270,7 @@ def measure_spans(log_sigma: Tensor, size_hw: tuple[int, int]) -> Tensor:
     return torch.minimum((2 * SPAN_SIGMAS * log_sigma.exp()).clamp_min(SAMPLES), most)
 
 
-def find_cells(positions: Tensor, size_hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def find_cells(positions: Tensor, size_hw: Sequence[int]) -> tuple[Tensor, Tensor]:
     """The four cells around each of positions (B, R, C, S, 2), and their weights in bilinear interpolation.
 
     positions: x, y in cells of grids of size_hw. Returns (B, R, C, S, 4) int64, counted row by row and grid by grid,
@@ -291,7 +298,7 @@ def shrink(x: Tensor, pool: int) -> Tensor:
     return x if pool == 1 else F.avg_pool2d(x, pool, ceil_mode=True)
 
 
-def enlarge(x: Tensor, pool: int, size_hw: tuple[int, int]) -> Tensor:
+def enlarge(x: Tensor, pool: int, size_hw: Sequence[int]) -> Tensor:
     """Give every cell the value of its square: the shape that shrink made of a map of size_hw -> (B, C, H, W)."""
     repeated = x.repeat_interleave(pool, dim=2).repeat_interleave(pool, dim=3)
     return repeated[:, :, : size_hw[0], : size_hw[1]]

@@ -4,6 +4,7 @@ The trunk has the topology of XFeat (Potje et al., CVPR 2024), whose public weig
 it. The fine branch at 1/2 is ours.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -128,5 +129,5 @@ def load_xfeat(trunk: XFeatTrunk, path: Path) -> None:
     trunk.load_state_dict({key: renamed.get(key, value) for key, value in wanted.items()})
 
 
-def _resize(x: Tensor, size: tuple[int, int]) -> Tensor:
-    return F.interpolate(x, size, mode="bilinear", align_corners=False)
+def _resize(x: Tensor, size: Sequence[int]) -> Tensor:
+    return F.interpolate(x, list(size), mode="bilinear", align_corners=False)

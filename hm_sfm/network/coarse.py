@@ -6,6 +6,7 @@ A coarse stage is a module with `describe`, run once per image on the backbone's
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -169,7 +170,8 @@ def half_precision_factors(device: str) -> Iterator[None]:
 
     Autocast itself would round the products, and make equals of similarities that are not.
     """
-    products = torch.backends.cuda.matmul if device == "cuda" else torch.backends.mkldnn.matmul
+    # PyTorch's own type hints lack the latter.
+    products: Any = torch.backends.cuda.matmul if device == "cuda" else torch.backends.mkldnn.matmul
     before = products.fp32_precision
     if torch.is_autocast_enabled(device):
         products.fp32_precision = "tf32" if device == "cuda" else "bf16"

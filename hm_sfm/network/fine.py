@@ -5,6 +5,7 @@ Patch coordinates are those of homography.py: cells of the 1/2 grid relative to 
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -134,7 +135,7 @@ def convolve(maps: Tensor, layer: nn.Conv2d) -> Tensor:
     """
     if torch.is_grad_enabled():
         return layer(maps.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
-    (side, _), (stride, _), (pad, _) = layer.kernel_size, layer.stride, layer.padding
+    side, stride, pad = (int(value[0]) for value in (layer.kernel_size, layer.stride, layer.padding))
     windows = F.pad(maps, (0, 0, pad, pad, pad, pad)).unfold(1, side, stride).unfold(2, side, stride)
     weight = layer.weight.permute(0, 2, 3, 1).flatten(1)
     return F.linear(windows.permute(0, 1, 2, 4, 5, 3).flatten(3), weight, layer.bias)
@@ -147,6 +148,10 @@ class HomographyHead(nn.Module):
     paper: 0), so that points moved beyond w x w still see features. radius: r of the sampled windows. spacing: a power
     of 2, at most (w - 1) / 2: of the patch of A, only cells so far from each other are looked up in B (the paper: 1).
     """
+
+    grid: Tensor
+    pooling: Tensor
+    first_look: Tensor
 
     def __init__(self, window: int, radius: int, iterations: int, margin: int, spacing: int = 1) -> None:
         super().__init__()
@@ -164,14 +169,14 @@ class HomographyHead(nn.Module):
         self.scale = nn.Conv2d(width, 1, 3)
         for layer in (self.corners, self.scale):
             nn.init.normal_(layer.weight, std=1e-3)
-            nn.init.zeros_(layer.bias)
+            nn.init.zeros_(cast(Tensor, layer.bias))
         self.register_buffer("grid", make_patch_grid((window - 1) / 2, spacing), persistent=False)
         self.register_buffer("pooling", make_pooling(window + 2 * margin), persistent=False)
         first_look = make_first_look(self.grid + self.half + margin, radius, self.pooling)
         self.register_buffer("first_look", first_look, persistent=False)
 
     @property
-    def half(self) -> float:
+    def half(self) -> float:  # pyright: ignore[reportIncompatibleMethodOverride] nobody casts a head to half precision
         """Distance of a patch's corner cells from its centre along each axis, cells."""
         return (self.window - 1) / 2
 
@@ -207,6 +212,7 @@ class HomographyHead(nn.Module):
                 displacement = displacement.detach()
                 with torch.no_grad():
                     target = apply_homography(homography_from_corners(displacement, self.half), self.grid)
+                assert pooled is not None  # as iterations > 1 or start is given
                 samples = self.look_up(full, pooled, target)
             residual, log_scale = self.decode(samples, target)
             displacement = displacement + residual
@@ -241,6 +247,8 @@ class ExpectationHead(nn.Module):
     The homography is the plain shift to it; the error scale is the spread of the distribution.
     """
 
+    positions: Tensor
+
     def __init__(self, window: int, margin: int) -> None:
         super().__init__()
         self.window, self.margin = window, margin
@@ -248,7 +256,7 @@ class ExpectationHead(nn.Module):
         self.register_buffer("positions", make_patch_grid(half1), persistent=False)
 
     @property
-    def half(self) -> float:
+    def half(self) -> float:  # pyright: ignore[reportIncompatibleMethodOverride] nobody casts a head to half precision
         """As in HomographyHead."""
         return (self.window - 1) / 2
 

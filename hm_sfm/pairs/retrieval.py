@@ -9,6 +9,7 @@ and go.
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import h5py
@@ -16,6 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 from hm_sfm.config import fingerprint
+from hm_sfm.io.arrays import read_array
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.io.batches import store_in_batches
 from hm_sfm.photos.hypotheses import ROTATIONS_DEG, Hypothesis, apply_hypothesis
@@ -76,7 +78,8 @@ class CellStore:
                         opened.close()
                     file = self._file_of[digest]
                     opened = h5py.File(file, "r")
-                yield opened[digest][:count].astype(np.float32)
+                assert opened is not None
+                yield read_array(opened, digest, count).astype(np.float32)
         finally:
             if opened:
                 opened.close()
@@ -131,7 +134,11 @@ def encode_images(
         for image in images
         if any(name_sample(digests[image.name], rotation_deg) not in store for rotation_deg in rotations_deg)
     }
-    with store_in_batches(lambda batch: store.write(dict(batch))) as keep:
+
+    def write(batch: Sequence[tuple[str, np.ndarray]]) -> None:
+        store.write(dict(batch))
+
+    with store_in_batches(write) as keep:
         for digest, image in tqdm(missing.items(), desc="retrieval", unit="image", disable=quiet or not missing):
             prepared = prepare_image(image, LONG_EDGE_PX)
             for rotation_deg in rotations_deg:
@@ -157,7 +164,9 @@ def learn_vocabulary(cells: Iterable[np.ndarray]) -> np.ndarray:
     count = min(WORDS, max(1, len(cells) // CELLS_PER_WORD))
     cv2.setRNGSeed(0)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 10, 1e-4)
-    return cv2.kmeans(cells, count, None, stop, 1, cv2.KMEANS_PP_CENTERS)[2]
+    # OpenCV's own type hints lack that the labels to start from may be none.
+    start: Any = None
+    return cv2.kmeans(cells, count, start, stop, 1, cv2.KMEANS_PP_CENTERS)[2]
 
 
 def count_words(cells: np.ndarray, vocabulary: np.ndarray) -> np.ndarray:

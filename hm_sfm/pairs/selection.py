@@ -72,6 +72,7 @@ def select_pairs(
         pairs += pair_sequentially(names, config.window)
         if config.loop_top:
             pairs += _pair_similar(ordered, find_similar, config.loop_top, LOOP_WINDOWS * config.window)
+    positions = positions or {}
     if config.mode == "spatial" and not positions:
         raise InputError(f"pairs mode 'spatial' needs photos with a GPS position in EXIF, found none in {len(names)}")
     if config.mode == "spatial" and len(positions) < len(names):

@@ -129,15 +129,18 @@ def read_ref(path: Path, name: str | None = None) -> ImageRef:
         raise InputError(f"{path} is cut short or cannot be decoded")
     size_wh = (bitmap.width, bitmap.height)
     _check_size(size_wh, str(path))
-    return ImageRef(name, path, size_wh, ROTATION_FROM_EXIF.get(bitmap.exif_orientation(), 0), _read_gps(bitmap))
+    rotation_deg = ROTATION_FROM_EXIF.get(bitmap.exif_orientation() or 1, 0)
+    return ImageRef(name, path, size_wh, rotation_deg, _read_gps(bitmap))
 
 
 def _read_gps(bitmap: pycolmap.Bitmap) -> tuple[float, float, float] | None:
     """ImageRef.gps; None unless EXIF has all of it, as COLMAP does, and where receivers without a fix left zeros."""
-    position = (bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude())
-    if None in position or not np.isfinite(position).all() or position[:2] == (0, 0):
+    latitude, longitude, altitude = bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()
+    if latitude is None or longitude is None or altitude is None:
         return None
-    return position if abs(position[0]) <= 90 and abs(position[1]) <= 180 else None
+    if not np.isfinite([latitude, longitude, altitude]).all() or latitude == longitude == 0:
+        return None
+    return (latitude, longitude, altitude) if abs(latitude) <= 90 and abs(longitude) <= 180 else None
 
 
 def prepare_image(ref: ImageRef, long_edge_px: int) -> PreparedImage:
@@ -200,7 +203,7 @@ def _prepare(ref: ImageRef, stored: np.ndarray, long_edge_px: int) -> PreparedIm
     width, height = ref.size_wh
     reduced_wh = (max(1, round(width * scale)), max(1, round(height * scale)))
     reduced = stored if scale == 1.0 else cv2.resize(stored, reduced_wh, interpolation=cv2.INTER_AREA)
-    grey = reduced.astype(np.float32) / np.iinfo(reduced.dtype).max
+    grey = reduced.astype(np.float32) / np.iinfo(reduced.dtype.type).max
     if ref.rotation_deg:
         grey = cv2.rotate(grey, CV_ROTATIONS[ref.rotation_deg])
     scaled_wh = (grey.shape[1], grey.shape[0])

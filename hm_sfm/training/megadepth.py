@@ -20,6 +20,7 @@ import numpy as np
 from torch.utils.data import Dataset
 
 from hm_sfm.errors import ConfigError, InputError
+from hm_sfm.io.arrays import read_array
 from hm_sfm.training.photos import POINTS, disturb_view
 from hm_sfm.types import PinholeView
 
@@ -208,7 +209,7 @@ def read_depth(path: Path) -> np.ndarray:
     """(h, w) float32 z-depth, 0 where unknown. Raises InputError where there is no such 2D map in the file."""
     try:
         with h5py.File(path, "r") as file:
-            depth = np.asarray(file["depth"][()], np.float32)
+            depth = read_array(file, "depth").astype(np.float32, copy=False)
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise InputError(f"cannot read the depth map {path}: {' '.join(str(error).split())[:200]}") from error
     if depth.ndim != 2:

@@ -10,6 +10,7 @@ import numpy as np
 from hm_sfm.errors import InputError
 from hm_sfm.formats.hloc import find_group, open_h5, read_features, read_pair
 from hm_sfm.geometry.frames import px_from_pixel_index
+from hm_sfm.io.arrays import open_group, read_array
 from hm_sfm.matching.interfaces import ImageFeatures, PointPairs
 from hm_sfm.photos.images import PreparedImage
 from hm_sfm.types import ImagePair, ImageRef
@@ -39,10 +40,11 @@ class MatchFile:
         pair = ImagePair(images[0].name, images[1].name)
         with open_h5(self.matches) as h5:
             group, swapped = locate_pairs(h5, self.matches, [pair])[0]
-            if "matches0" in h5[group]:
+            data = open_group(h5, group)
+            if "matches0" in data:
                 stored, score = self.read_indexed(h5, pair, group, swapped, images)
             else:
-                stored, score = self.read_points(h5[group], swapped, images)
+                stored, score = self.read_points(data, swapped, images)
         xy = {}
         for features, points in zip(sides, stored):
             scaled_from_stored = np.linalg.inv(features.stored_from_scaled)
@@ -68,13 +70,13 @@ class MatchFile:
         self, group: h5py.Group, swapped: bool, images: Sequence[ImageRef]
     ) -> tuple[list[np.ndarray], np.ndarray]:
         """(M, 2) float64 px of the two stored images, in their order, and (M,) scores. Raises as match does."""
-        where = f"{self.matches} has in its group {group.name[1:]!r}"
-        points = [group[name][()] for name in ("keypoints0", "keypoints1")]
+        where = f"{self.matches} has in its group {str(group.name)[1:]!r}"
+        points = [read_array(group, name) for name in ("keypoints0", "keypoints1")]
         for xy in points:
             if xy.ndim != 2 or xy.shape[1] != 2 or xy.shape != points[0].shape:
                 shapes = " and ".join(str(xy.shape) for xy in points)
                 raise InputError(f"{where} points of shapes {shapes}: both must have the same shape (M, 2)")
-        score = group["scores"][()] if "scores" in group else np.ones(len(points[0]))
+        score = read_array(group, "scores") if "scores" in group else np.ones(len(points[0]))
         if score.shape != (len(points[0]),):
             raise InputError(f"{where} {len(points[0])} matches but scores of shape {score.shape}")
         if not all(np.isfinite(values).all() for values in (*points, score)):
@@ -99,4 +101,4 @@ def locate_pairs(h5: h5py.File, path: Path, pairs: Sequence[ImagePair]) -> list[
             f"{path} lacks {len(missing)} of {len(pairs)} pairs, for example {missing[0].name0!r} and "
             f"{missing[0].name1!r}: it is of other photos, or of another list of pairs (name its own with --pairs FILE)"
         )
-    return groups
+    return [group for group in groups if group is not None]

@@ -72,9 +72,9 @@ def test_an_image_in_no_pair(run):
     run.deregister(first)
     run.forget_pairs(first, others)
     run.pairs = [pair for pair in run.pairs if first not in (pair.name0, pair.name1)]
-    (found,) = run.diagnose()
-    assert (found.cause, list(found.reasons)) == (Cause.UNPAIRED, [first])
-    assert found.advice == ("--pairs exhaustive",)
+    (diagnosis,) = run.diagnose()
+    assert (diagnosis.cause, list(diagnosis.reasons)) == (Cause.UNPAIRED, [first])
+    assert diagnosis.advice == ("--pairs exhaustive",)
 
 
 def test_too_few_matches_name_the_best_neighbour(run):
@@ -82,17 +82,17 @@ def test_too_few_matches_name_the_best_neighbour(run):
     run.deregister(last)
     run.forget_pairs(last, run.names[:-1])
     run.scores[ImagePair(run.names[1], last)] = 21
-    (found,) = run.diagnose()
-    assert found.cause == Cause.FEW_MATCHES
-    assert found.reasons == {last: f"at most 21, with {run.names[1]}; 30 are needed"}
-    assert found.advice == ("photos taken in between", "--set images.long_edge_px=1600")
+    (diagnosis,) = run.diagnose()
+    assert diagnosis.cause == Cause.FEW_MATCHES
+    assert diagnosis.reasons == {last: f"at most 21, with {run.names[1]}; 30 are needed"}
+    assert diagnosis.advice == ("photos taken in between", "--set images.long_edge_px=1600")
     line = f"1 not in the model, too few good matches: {last} (at most 21, with {run.names[1]}; 30 are needed); try "
-    assert str(found) == line + "photos taken in between, or --set images.long_edge_px=1600"
+    assert str(diagnosis) == line + "photos taken in between, or --set images.long_edge_px=1600"
 
     run.config = dataclasses.replace(run.config, images=ImageConfig(long_edge_px=4000))
     run.pairs = run.pairs[1:]
-    (found,) = run.diagnose()
-    assert found.advice == ("photos taken in between", "--pairs exhaustive")
+    (diagnosis,) = run.diagnose()
+    assert diagnosis.advice == ("photos taken in between", "--pairs exhaustive")
 
 
 def test_matches_that_disagree(run):
@@ -100,16 +100,19 @@ def test_matches_that_disagree(run):
     run.deregister(last)
     run.forget_pairs(last, run.names[:-1])
     run.scores[ImagePair(run.names[0], last)] = 30
-    (found,) = run.diagnose()
-    assert (found.cause, found.reasons[last]) == (Cause.DISAGREEING, f"30 with {run.names[0]}, too few of them agree")
+    (diagnosis,) = run.diagnose()
+    assert (diagnosis.cause, diagnosis.reasons[last]) == (
+        Cause.DISAGREEING,
+        f"30 with {run.names[0]}, too few of them agree",
+    )
 
 
 def test_an_image_of_another_model(run):
     whole = pycolmap.Reconstruction(run.model)
     run.deregister(run.names[2])
     run.models = [run.model, whole]
-    (found,) = run.diagnose()
-    assert (found.cause, found.reasons) == (Cause.OTHER_MODEL, {run.names[2]: "sparse/1, 4 images"})
+    (diagnosis,) = run.diagnose()
+    assert (diagnosis.cause, diagnosis.reasons) == (Cause.OTHER_MODEL, {run.names[2]: "sparse/1, 4 images"})
 
 
 def test_verified_pairs_outside_the_model_only(run):
@@ -117,36 +120,36 @@ def test_verified_pairs_outside_the_model_only(run):
     for name in outside:
         run.deregister(name)
         run.forget_pairs(name, inside)
-    (found,) = run.diagnose()
-    assert found.cause == Cause.APART
-    assert list(found.reasons) == outside
-    assert found.reasons[outside[0]].endswith(f"verified matches with {outside[1]}")
+    (diagnosis,) = run.diagnose()
+    assert diagnosis.cause == Cause.APART
+    assert list(diagnosis.reasons) == outside
+    assert diagnosis.reasons[outside[0]].endswith(f"verified matches with {outside[1]}")
 
 
 def test_points_of_the_model_in_view_are_counted(run):
     name = run.names[1]
     run.deregister(name)
-    (found,) = run.diagnose()
-    assert (found.cause, found.reasons[name]) == (Cause.NO_POSE, "120 points of the model in view")
-    assert found.advice == ("--camera-mode per-image",)
+    (diagnosis,) = run.diagnose()
+    assert (diagnosis.cause, diagnosis.reasons[name]) == (Cause.NO_POSE, "120 points of the model in view")
+    assert diagnosis.advice == ("--camera-mode per-image",)
 
     run.cameras.cameras[0].has_prior_focal_length = False
-    (found,) = run.diagnose()
-    assert found.reasons[name].endswith(", focal length unknown")
-    assert "--camera-params" in found.advice[0]
+    (diagnosis,) = run.diagnose()
+    assert diagnosis.reasons[name].endswith(", focal length unknown")
+    assert "--camera-params" in diagnosis.advice[0]
 
     for point_id in sorted(run.model.points3D)[29:]:
         run.model.delete_point3D(point_id)
-    (found,) = run.diagnose()
-    assert (found.cause, found.reasons[name]) == (Cause.FEW_POINTS, "29; 30 are needed")
+    (diagnosis,) = run.diagnose()
+    assert (diagnosis.cause, diagnosis.reasons[name]) == (Cause.FEW_POINTS, "29; 30 are needed")
 
 
 def test_no_model_in_spite_of_good_pairs(run):
     run.models = []
-    (found,) = run.diagnose()
-    assert (found.cause, list(found.reasons)) == (Cause.NO_START, run.names)
-    assert found.reasons[run.names[0]].startswith("120 verified matches with ")
-    assert f"{run.names[MOST_LISTED - 1]} (" in str(found)
+    (diagnosis,) = run.diagnose()
+    assert (diagnosis.cause, list(diagnosis.reasons)) == (Cause.NO_START, run.names)
+    assert diagnosis.reasons[run.names[0]].startswith("120 verified matches with ")
+    assert f"{run.names[MOST_LISTED - 1]} (" in str(diagnosis)
 
 
 def test_the_same_view_twice_has_no_baseline(tmp_path):
@@ -160,10 +163,10 @@ def test_the_same_view_twice_has_no_baseline(tmp_path):
     path = tmp_path / "database.db"
     write_database(path, images, cameras, keypoints, [matches])
     verify_database(path, VerificationConfig(), num_threads=1)
-    (found,) = diagnose(images, cameras, [pair], Run.read, path, (), Config())
-    assert found.cause == Cause.SMALL_BASELINE
-    assert found.reasons["a.jpg"] == "rays meet at 0.0 degrees at most, focal length unknown"
-    assert found.advice[0] == "photos from places farther apart"
+    (diagnosis,) = diagnose(images, cameras, [pair], Run.read, path, (), Config())
+    assert diagnosis.cause == Cause.SMALL_BASELINE
+    assert diagnosis.reasons["a.jpg"] == "rays meet at 0.0 degrees at most, focal length unknown"
+    assert diagnosis.advice[0] == "photos from places farther apart"
 
 
 def test_long_lists_are_cut():

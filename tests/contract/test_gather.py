@@ -51,8 +51,8 @@ def run(tmp_path_factory) -> tuple[Path, list[ImageRef], pycolmap.Reconstruction
 @pytest.fixture(scope="module")
 def report(run):
     out, images, model = run
-    found = Diagnosis(Cause.NO_POSE, {images[4].name: "why"}, ())
-    return gather_report(out, images, 10, [model], [found], Config())
+    diagnosis = Diagnosis(Cause.NO_POSE, {images[4].name: "why"}, ())
+    return gather_report(out, images, 10, [model], [diagnosis], Config())
 
 
 def test_figures_of_images_are_those_of_the_model(run, report):
@@ -110,17 +110,17 @@ def test_scene_is_the_model_turned_and_scaled(run, report):
 
 
 def test_photos_on_their_sides_stand_upright(run):
-    """Turned cameras show the same scene the same way when EXIF says how they were turned."""
+    """Rotated cameras show the same scene the same way when EXIF says how they were rotated."""
     _, images, model = run
     names = {image.name: 0 for image in images}
     upright = lay_out_scene(model, names)
     quarter = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, 0, -np.pi / 2])), np.zeros(3))
-    turned = pycolmap.Reconstruction(model)
-    for frame_id in turned.reg_frame_ids():
-        frame = turned.frame(frame_id)
+    rotated = pycolmap.Reconstruction(model)
+    for frame_id in rotated.reg_frame_ids():
+        frame = rotated.frame(frame_id)
         frame.rig_from_world = quarter * frame.rig_from_world
-    np.testing.assert_allclose(lay_out_scene(turned, dict.fromkeys(names, 90)).xyz, upright.xyz, atol=1e-4)
-    assert np.abs(lay_out_scene(turned, names).xyz - upright.xyz).max() > 0.05
+    np.testing.assert_allclose(lay_out_scene(rotated, dict.fromkeys(names, 90)).xyz, upright.xyz, atol=1e-4)
+    assert np.abs(lay_out_scene(rotated, names).xyz - upright.xyz).max() > 0.05
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ TRAINING = Path(__file__).parents[2] / "pipelines" / "training"
 
 @pytest.fixture
 def ablate(scene, tmp_path, monkeypatch, capfd):
-    """Run ablate.py for two steps a variant, on pairs of noise and two photos of the small scene; what it printed."""
+    """Run ablate.py for two steps per version, on pairs of noise and two photos of the small scene; what it printed."""
     monkeypatch.syspath_prepend(TRAINING)
     scores, recipe = importlib.import_module("ablation_scores"), importlib.import_module("ablate")
     for name, value in {"PAIRS": 2, "SIZE_WH": (160, 128), "TIMED_PATCHES": 40, "TIMED_CALLS": 1}.items():
@@ -39,7 +39,7 @@ def ablate(scene, tmp_path, monkeypatch, capfd):
         cv2.imwrite(str(photos / f"{seed}.png"), np.clip(128 + 40 * noise / noise.std(), 0, 255).astype(np.uint8))
     config = tmp_path / "train.yaml"
     config.write_text(
-        f"{{images: {photos}, out: {tmp_path / 'variants'}, start_from: {checkpoints.find_weights('light')}, "
+        f"{{images: {photos}, out: {tmp_path / 'versions'}, start_from: {checkpoints.find_weights('light')}, "
         "size_px: 64, pairs_per_step: 1, patches_per_pair: 8, precision: fp32, device: cpu}"
     )
 
@@ -72,13 +72,13 @@ def test_ablate(ablate, tmp_path, monkeypatch, matched_pairs):
     assert all(0 <= float(value) <= 100 for line in cells[2:5] for value in line[1:])
     # What the first table's last row tells is the same network.
     assert cells[4][1:] == cells[8][1:-1]
-    trained = sorted(path.parent.name for path in (tmp_path / "variants").glob("*/weights.pt"))
+    trained = sorted(path.parent.name for path in (tmp_path / "versions").glob("*/weights.pt"))
     assert trained == ["expectation-9-1-2-2-centre"] + [
         f"homography-9-1-2-2-{supervise}" for supervise in ("centre", "dense", "suppressed")
     ]
 
-    # The variants have the features in common that they start from; all heads start new.
-    features = checkpoints.read_checkpoint(tmp_path / "variants" / "features.pt")["state_dict"]
+    # All versions start from the same features, with new heads.
+    features = checkpoints.read_checkpoint(tmp_path / "versions" / "features.pt")["state_dict"]
     assert features.keys() == {key for key in light.state_dict() if not key.startswith("head.")}
 
     # All is done: nothing is trained or matched, and without the weights there are two tables.
@@ -94,4 +94,4 @@ def test_ablate_refuses_weights_without_a_transformer(ablate, tmp_path, capfd):
         ablate("--attention-weights", "light")
     assert stop.value.code == 2
     assert "light has no coarse transformer: network.coarse is 'cosine'" in capfd.readouterr().err
-    assert not (tmp_path / "variants").exists()
+    assert not (tmp_path / "versions").exists()

@@ -156,12 +156,12 @@ def test_pairs_are_correct_where_the_reference_agrees(reconstructed, load):
 
 
 def test_snapping_makes_tracks_and_keeps_matches_one_to_one(load):
-    found = {
+    matches = {
         # The second match leaves from the cell of the first, the third one arrives there.
         PAIR_AB: PointMatches([[10.4, 5.6], [10.9, 5.9], [20, 20]], [[0.9, 1.5], [7, 7], [0.1, 2.5]]),
         PAIR_AC: PointMatches([[9.6, 5.5]], [[3.1, 3.1]]),
     }
-    keypoints, matches = load("peers").snap(["a.jpg", "b.jpg", "c.jpg", "d.jpg"], found, 2.0)
+    keypoints, matches = load("peers").snap(["a.jpg", "b.jpg", "c.jpg", "d.jpg"], matches, 2.0)
     assert [points.name for points in keypoints] == ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
     a, b, c, d = (points.xy.tolist() for points in keypoints)
     assert sorted(a) == [[10, 6], [20, 20]] and c == [[4, 4]] and d == []
@@ -180,9 +180,9 @@ def test_keeping_one_to_one_prefers_what_comes_first(load):
 def test_peers_see_photos_as_hm_sfm_does(tmp_path, load):
     pixels = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (120, 200, 3), np.uint8), (0, 0), 3)
     exif = Image.Exif()
-    exif[0x0112] = 6  # to be turned by 90 degrees
-    Image.fromarray(pixels).save(tmp_path / "turned.png", exif=exif)
-    prepared = load("peers").read_photo(tmp_path / "turned.png", 100)
+    exif[0x0112] = 6  # to be rotated by 90 degrees
+    Image.fromarray(pixels).save(tmp_path / "rotated.png", exif=exif)
+    prepared = load("peers").read_photo(tmp_path / "rotated.png", 100)
     rgb = read_rgb(prepared)
     assert rgb.shape == (100, 60, 3)
     assert np.abs(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) / 255 - prepared.grey).max() < 0.01
@@ -223,8 +223,8 @@ def test_sparse_peers_come_into_colmaps_frame(scene, load, monkeypatch):
     assert [points.name for points in keypoints] == names
     assert keypoints[0].xy.tolist() == [[0.5, 0.5], [10.5, 10.5], [20.5, 20.5], [30.5, 30.5]]
     assert [m.pair for m in matches] == pairs and matches[0].indices.tolist() == [[1, 1], [2, 2], [3, 3]]
-    found = matcher.match(images[0].path, images[2].path)
-    assert found.xy1.tolist() == [[10.5, 10.5], [20.5, 20.5], [30.5, 30.5]]
+    matches = matcher.match(images[0].path, images[2].path)
+    assert matches.xy1.tolist() == [[10.5, 10.5], [20.5, 20.5], [30.5, 30.5]]
     assert FakeAliked.encoded == 3 and matcher.seconds > 0
 
 
@@ -238,10 +238,10 @@ def test_hm_sfm_in_the_benchmark_drops_what_a_reconstruction_drops(scene, load):
     assert counts[0] == len(peers.HmSfmAll(Config()).match(*paths)) > counts[1] > counts[2] == 0
 
 
-def make_score(load, scene, method, **figures):
+def make_score(load, scene, method, **metrics):
     fixed = {"images": 10, "registered": 8, "verified": 20, "judged": None, "correct": None, "points": 100}
     means = {"track_length": 3.0, "reprojection_px": 0.5, "seconds": 1.4}
-    return load("scene_scores").SceneScore(scene, method, **(fixed | means | figures))
+    return load("scene_scores").SceneScore(scene, method, **(fixed | means | metrics))
 
 
 def test_scores_add_up(load):

@@ -188,8 +188,8 @@ def wait_for_pairs(process, out, count) -> None:
         time.sleep(0.005)
 
 
-def assert_same_matches(found, expected) -> None:
-    assert found.keys() == expected.keys()
+def assert_same_matches(actual, expected) -> None:
+    assert actual.keys() == expected.keys()
     for pair, fields in expected.items():
         for field, data in fields.items():
-            np.testing.assert_array_equal(found[pair][field], data, err_msg=f"{pair} {field}")
+            np.testing.assert_array_equal(actual[pair][field], data, err_msg=f"{pair} {field}")

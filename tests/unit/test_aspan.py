@@ -64,8 +64,8 @@ def make_shifted(generator: torch.Generator, shift: tuple[int, int]) -> tuple[to
     row, column = torch.meshgrid(torch.arange(9), torch.arange(12), indexing="ij")
     there_x, there_y = (column - shift[0]).flatten(), (row - shift[1]).flatten()
     seen = ((there_x >= 0) & (there_x < 12) & (there_y >= 0) & (there_y < 9)).nonzero().flatten()
-    truth = CoarseSupervision(torch.zeros_like(seen), seen, (there_y * 12 + there_x)[seen])
-    return torch.stack([first, second]), truth
+    supervision = CoarseSupervision(torch.zeros_like(seen), seen, (there_y * 12 + there_x)[seen])
+    return torch.stack([first, second]), supervision
 
 
 def make_flow(height: int, width: int, sigma: float, generator: torch.Generator) -> Flow:
@@ -178,8 +178,8 @@ def test_a_map_is_sampled_between_its_cells_and_goes_on_beyond_its_edges(generat
         padding_mode="border",
         align_corners=False,
     )
-    found = sample(x, positions).flatten(1, 2).permute(0, 3, 1, 2)
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+    actual = sample(x, positions).flatten(1, 2).permute(0, 3, 1, 2)
+    torch.testing.assert_close(actual, expected, atol=1e-5, rtol=1e-4)
     ends = torch.tensor([[0.0, 0.0], [3.0, 4.0], [9.0, 9.0]]).view(1, 1, 1, 3, 2)
     assert torch.equal(sample(x[:1], ends)[0, 0, 0], torch.stack([x[0, :, 0, 0], x[0, :, 4, 3], x[0, :, 4, 3]]))
 
@@ -249,26 +249,30 @@ def test_the_tokens_that_a_cell_sees_are_bounded(coarse, generator, monkeypatch,
 
 @torch.no_grad()
 def test_a_new_network_starts_near_the_plain_features(coarse, generator):
-    maps, truth = make_shifted(generator, (2, -1))
+    maps, supervision = make_shifted(generator, (2, -1))
     cells = as_cells(coarse.describe(maps))
     index0, index1, confidence = coarse.match(cells[0], cells[1], 0.2)
-    assert len(index0.unique()) == len(index1.unique()) == len(index0) > 0.9 * len(truth.index0)
+    assert len(index0.unique()) == len(index1.unique()) == len(index0) > 0.9 * len(supervision.index0)
     assert (confidence >= 0.2).all() and confidence.max() <= 1
-    found, true = (set(zip(i.tolist(), j.tolist())) for i, j in ((index0, index1), (truth.index0, truth.index1)))
-    assert len(found & true) > 0.9 * len(true)
+    actual, true = (
+        set(zip(i.tolist(), j.tolist())) for i, j in ((index0, index1), (supervision.index0, supervision.index1))
+    )
+    assert len(actual & true) > 0.9 * len(true)
     back1, back0, _ = coarse.match(cells[1], cells[0], 0.2)
-    assert set(zip(back0.tolist(), back1.tolist())) == found
+    assert set(zip(back0.tolist(), back1.tolist())) == actual
     assert not len(coarse.match(cells[0], cells[1], 1.1)[0])
 
 
 def test_gradients_reach_all_parameters(coarse, generator):
-    maps, truth = make_shifted(generator, (2, -1))
+    maps, supervision = make_shifted(generator, (2, -1))
     cells = as_cells(coarse.describe(maps))
     cells0, cells1 = cells[:1], as_cells(coarse.describe(maps[1:, :, :7]))
-    kept = truth.index1 < 7 * 12
-    truth = CoarseSupervision(*(getattr(truth, field.name)[kept] for field in dataclasses.fields(truth)))
+    kept = supervision.index1 < 7 * 12
+    supervision = CoarseSupervision(
+        *(getattr(supervision, field.name)[kept] for field in dataclasses.fields(supervision))
+    )
     aware0, aware1, flows = coarse.estimate(cells0, cells1)
-    loss = measure_coarse_loss(aware0, aware1, coarse.sharpness, truth) + measure_flow_loss(flows, truth)
+    loss = measure_coarse_loss(aware0, aware1, coarse.sharpness, supervision) + measure_flow_loss(flows, supervision)
     loss.backward()
     assert [name for name, p in coarse.named_parameters() if p.grad is None or not p.grad.any()] == []
     assert all(p.grad.isfinite().all() for p in coarse.parameters())
@@ -276,7 +280,7 @@ def test_gradients_reach_all_parameters(coarse, generator):
 
 @pytest.mark.slow
 def test_the_flow_of_a_shifted_map_is_learnt(coarse, generator):
-    maps, truth = make_shifted(generator, (4, -2))
+    maps, supervision = make_shifted(generator, (4, -2))
     cells = as_cells(coarse.describe(maps))
     optimizer = torch.optim.Adam(coarse.parameters(), lr=8e-3)
 
@@ -284,15 +288,15 @@ def test_the_flow_of_a_shifted_map_is_learnt(coarse, generator):
         """Median error of the last block's flow, and the median of its standard deviations, cells."""
         with torch.no_grad():
             *_, (flow, _) = coarse.estimate(cells[:1], cells[1:])[2]
-        true = torch.stack([truth.index1 % 12, truth.index1 // 12])
-        sigma = flow.log_sigma[0].flatten(1)[:, truth.index0].exp()
-        return (flow.centre[0].flatten(1)[:, truth.index0] - true).norm(dim=0).median(), sigma.median()
+        true = torch.stack([supervision.index1 % 12, supervision.index1 // 12])
+        sigma = flow.log_sigma[0].flatten(1)[:, supervision.index0].exp()
+        return (flow.centre[0].flatten(1)[:, supervision.index0] - true).norm(dim=0).median(), sigma.median()
 
     first_error, first_sigma = measure_error()
     losses = []
     for _ in range(40):
         *_, flows = coarse.estimate(cells[:1], cells[1:])
-        losses.append(measure_flow_loss(flows, truth))
+        losses.append(measure_flow_loss(flows, supervision))
         optimizer.zero_grad()
         losses[-1].backward()
         optimizer.step()
@@ -306,15 +310,17 @@ def test_the_flow_loss_is_the_likelihood_of_a_gaussian(generator):
     flows = [
         tuple(Flow(*torch.randn(2, 2, 2, *size, generator=generator)) for size in ((3, 4), (5, 2))) for _ in range(3)
     ]
-    truth = CoarseSupervision(torch.tensor([0, 1, 1]), torch.tensor([0, 7, 11]), torch.tensor([3, 9, 0]))
+    supervision = CoarseSupervision(torch.tensor([0, 1, 1]), torch.tensor([0, 7, 11]), torch.tensor([3, 9, 0]))
     expected = []
     for flow0, flow1 in flows:
-        for item, i, j in zip(truth.image_index.tolist(), truth.index0.tolist(), truth.index1.tolist()):
+        for item, i, j in zip(
+            supervision.image_index.tolist(), supervision.index0.tolist(), supervision.index1.tolist()
+        ):
             here, there = (i // 4, i % 4), (j // 2, j % 2)
             for flow, at, true in ((flow0, here, there), (flow1, there, here)):
                 gaussian = torch.distributions.Normal(flow.centre[item, :, *at], flow.log_sigma[item, :, *at].exp())
                 expected.append(-gaussian.log_prob(torch.tensor(true[::-1])).sum() - np.log(2 * np.pi))
-    torch.testing.assert_close(measure_flow_loss(flows, truth), torch.stack(expected).mean())
+    torch.testing.assert_close(measure_flow_loss(flows, supervision), torch.stack(expected).mean())
 
 
 def test_pairs_without_matches_teach_the_flow_nothing(generator):

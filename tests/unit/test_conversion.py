@@ -178,11 +178,11 @@ def test_nerfstudio_with_cameras_of_their_own(out, tmp_path):
 def test_ply_has_the_points(out, tmp_path):
     convert_run(out, "ply", tmp_path / "new" / "points.ply")
     cloud = PlyData.read(tmp_path / "new" / "points.ply")["vertex"]
-    found = np.stack([cloud["x"], cloud["y"], cloud["z"]], axis=1)
+    actual = np.stack([cloud["x"], cloud["y"], cloud["z"]], axis=1)
     model = pycolmap.Reconstruction(out / "sparse" / "0")
     expected = np.array([point.xyz for point in model.points3D.values()])
-    order, other = np.lexsort(found.T), np.lexsort(expected.T)
-    np.testing.assert_allclose(found[order], expected[other], rtol=1e-5, atol=1e-6)
+    order, other = np.lexsort(actual.T), np.lexsort(expected.T)
+    np.testing.assert_allclose(actual[order], expected[other], rtol=1e-5, atol=1e-6)
     assert {"red", "green", "blue"} <= {field.name for field in cloud.properties}
 
 

@@ -13,7 +13,7 @@ from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 NAMES = ("a.jpg", "left/with space.jpg", "right/Köln — 教会.png")
 IMAGES = [ImageRef(name, Path(name), (600, 400)) for name in NAMES]
 PAIRS = [ImagePair(NAMES[0], NAMES[1]), ImagePair(NAMES[0], NAMES[2]), ImagePair(NAMES[1], NAMES[2])]
-UNITS = {NAMES[0]: 1.0, NAMES[1]: 2.5, NAMES[2]: 1.0}
+PX_SCALE = {NAMES[0]: 1.0, NAMES[1]: 2.5, NAMES[2]: 1.0}
 
 
 @pytest.fixture
@@ -30,21 +30,21 @@ def matches() -> list[IndexMatches]:
 
 @pytest.fixture
 def files(tmp_path, keypoints, matches) -> tuple[Path, Path]:
-    features, found = tmp_path / "new" / "features.h5", tmp_path / "new" / "matches.h5"
-    write_features(features, IMAGES, keypoints, UNITS)
-    write_matches(found, PAIRS, keypoints, matches)
-    assert sorted(path.name for path in features.parent.iterdir()) == ["features.h5", "matches.h5"]
-    return features, found
+    features_file, matches_file = tmp_path / "new" / "features.h5", tmp_path / "new" / "matches.h5"
+    write_features(features_file, IMAGES, keypoints, PX_SCALE)
+    write_matches(matches_file, PAIRS, keypoints, matches)
+    assert sorted(path.name for path in features_file.parent.iterdir()) == ["features.h5", "matches.h5"]
+    return features_file, matches_file
 
 
 def test_a_round_trip(files, keypoints, matches):
-    found = read_features(files[0], IMAGES)
-    for one, other in zip(found, keypoints, strict=True):
+    actual = read_features(files[0], IMAGES)
+    for one, other in zip(actual, keypoints, strict=True):
         assert one.name == other.name
         np.testing.assert_allclose(one.xy, other.xy, atol=1e-7)
         np.testing.assert_array_equal(one.sigma_px, other.sigma_px)
         np.testing.assert_array_equal(one.score, other.score)
-    read = read_matches(files[1], PAIRS, found)
+    read = read_matches(files[1], PAIRS, actual)
     assert [some.pair for some in read] == PAIRS
     assert [len(some) for some in read] == [3, 0, 0]
     expected = dict(zip(map(tuple, matches[0].indices.tolist()), matches[0].score.tolist()))
@@ -107,26 +107,26 @@ def test_pairs_in_the_other_order_and_of_early_versions(tmp_path, keypoints, gro
     swapped = group.startswith("left")
     partner = np.int16([-1, 4, 0, -1]) if swapped else np.int16([2, -1, -1, -1, 1])
     path = write_plain(tmp_path / "m.h5", {group: {"matches0": partner}})
-    (found,) = read_matches(path, PAIRS[:1], keypoints)
-    assert sorted(found.indices.tolist()) == [[0, 2], [4, 1]]
-    np.testing.assert_array_equal(found.score, [1, 1])
+    (actual,) = read_matches(path, PAIRS[:1], keypoints)
+    assert sorted(actual.indices.tolist()) == [[0, 2], [4, 1]]
+    np.testing.assert_array_equal(actual.score, [1, 1])
 
 
 def test_a_shorter_list_and_several_matches_of_a_keypoint(tmp_path, keypoints):
     """match_dense ends its list at the last match, and may match one keypoint of image 1 several times."""
     fields = {"matches0": np.int32([2, 2, 1]), "matching_scores0": np.float16([0.5, 0.75, 0.25])}
     path = write_plain(tmp_path / "m.h5", {"a.jpg/left-with space.jpg": fields})
-    (found,) = read_matches(path, PAIRS[:1], keypoints)
-    assert found.indices.tolist() == [[1, 2], [2, 1]]
-    np.testing.assert_array_equal(found.score, [0.75, 0.25])
+    (actual,) = read_matches(path, PAIRS[:1], keypoints)
+    assert actual.indices.tolist() == [[1, 2], [2, 1]]
+    np.testing.assert_array_equal(actual.score, [0.75, 0.25])
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_no_match_and_one(tmp_path, keypoints, count):
     fields = {"matches0": np.int32([3] * count), "matching_scores0": np.ones(count)}
     path = write_plain(tmp_path / "m.h5", {"a.jpg/left-with space.jpg": fields})
-    (found,) = read_matches(path, PAIRS[:1], keypoints)
-    assert found.indices.tolist() == [[0, 3]] * count
+    (actual,) = read_matches(path, PAIRS[:1], keypoints)
+    assert actual.indices.tolist() == [[0, 3]] * count
 
 
 # What does not fit

@@ -35,10 +35,10 @@ def make_collection(names: str, *pairs: PairMatches, cell_px=None, max_keypoints
         images, list(stored), stored.get, dict.fromkeys(names, unit), cell_px, max_keypoints
     )
     assert [points.name for points in keypoints] == list(names)
-    assert [found.pair for found in matches] == list(stored)
+    assert [each.pair for each in matches] == list(stored)
     return (
         {points.name: points for points in keypoints},
-        {found.pair.name0 + found.pair.name1: found for found in matches},
+        {each.pair.name0 + each.pair.name1: each for each in matches},
     )
 
 
@@ -156,7 +156,7 @@ def test_snapping_joins_what_lies_within_a_pixel():
     assert all(len(points) == 1 for points in keypoints.values())
     np.testing.assert_array_equal(keypoints["b"].xy, [(20, 9)])
     np.testing.assert_allclose(keypoints["b"].score, [1.8], rtol=1e-6)
-    assert [found.indices.tolist() for found in matches.values()] == [[[0, 0]]] * 3
+    assert [each.indices.tolist() for each in matches.values()] == [[[0, 0]]] * 3
 
 
 def test_pixels_are_those_of_the_matching_resolution():
@@ -170,7 +170,7 @@ def test_pixels_are_those_of_the_matching_resolution():
     )
     np.testing.assert_array_equal(keypoints["a"].xy, [(32, 32)])
     np.testing.assert_array_equal(keypoints["a"].sigma_px, [4])
-    assert [found.indices.tolist() for found in matches.values()] == [[[0, 0]], [[0, 0]]]
+    assert [each.indices.tolist() for each in matches.values()] == [[[0, 0]], [[0, 0]]]
 
 
 def test_points_far_from_the_keypoint_of_their_cell_lose_their_matches():
@@ -180,16 +180,16 @@ def test_points_far_from_the_keypoint_of_their_cell_lose_their_matches():
         "abcde", *(make_matches("a", name, [row]) for name, row in zip("bcde", rows)), cell_px=8
     )
     np.testing.assert_array_equal(keypoints["a"].xy, [(5, 6)])
-    assert [len(found) for found in matches.values()] == [1, 1, 0, 1]
+    assert [len(each) for each in matches.values()] == [1, 1, 0, 1]
 
 
 def test_points_join_the_nearest_keypoint_across_cells():
-    # 7.49 and 7.51 round to two keypoints; with a budget of one, both go to the better one.
+    # 7.49 and 7.51 round to two keypoints; with room for one, both go to the better one.
     first = make_matches("a", "b", [(7.49, 3, 50, 50, 0.9), (7.49, 30, 60, 60, 0.1)])
     second = make_matches("a", "c", [(7.51, 3, 50, 50, 0.2)])
     keypoints, matches = make_collection("abc", first, second, cell_px=1, max_keypoints=1)
     np.testing.assert_array_equal(keypoints["a"].xy, [(7, 3)])
-    assert [found.indices.tolist() for found in matches.values()] == [[[0, 0]], [[0, 0]]]
+    assert [each.indices.tolist() for each in matches.values()] == [[[0, 0]], [[0, 0]]]
 
 
 def test_matches_are_one_to_one_and_the_best_score_wins():
@@ -204,4 +204,4 @@ def test_images_without_pairs_and_pairs_without_matches(cell_px):
         "abcd", make_matches("a", "b", []), make_matches("a", "c", [(8, 8, 9, 9, 0.5)]), cell_px=cell_px
     )
     assert [len(points) for points in keypoints.values()] == [1, 0, 1, 0]
-    assert [len(found) for found in matches.values()] == [0, 1]
+    assert [len(each) for each in matches.values()] == [0, 1]

@@ -77,10 +77,10 @@ def test_epipolar_errors_are_distances_in_px(tmp_path):
 def test_pictures_of_photos_are_numbered_reduced_and_whole(tmp_path):
     pair = make_pair(tmp_path, long_edge=2048)
     pictures = MatchPictures(tmp_path / "out" / "pictures")
-    truth = np.array([[1, 0, 10.0], [0, 1, 0], [0, 0, 1]])
+    true = np.array([[1, 0, 10.0], [0, 1, 0], [0, 0, 1]])
     # 8 px off in the photo are 4 px in a picture of half its size: no longer red.
     matches = make_matches([[1000.0, 801.0]], [[1018.0, 801.0]])
-    pictures.draw_homography(pair.path0, pair.path1, truth, matches)
+    pictures.draw_homography(pair.path0, pair.path1, true, matches)
     pictures.draw_poses(pair, make_matches([], []))
     names = sorted(path.name for path in pictures.folder.iterdir())
     assert names == ["0000_a-b.png", "0001_a-b.png"]

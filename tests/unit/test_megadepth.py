@@ -1,4 +1,4 @@
-"""MegaDepth pairs, on a tiny MegaDepth that is rendered: the truth of every pixel is known."""
+"""MegaDepth pairs, on a tiny MegaDepth that is rendered: the ground truth of every pixel is known."""
 
 import dataclasses
 import pickle
@@ -181,10 +181,10 @@ def map_pixels(b_from_a, surface):
 
 
 def measure_errors(folders, pair, size_wh=SIZE_WH):
-    """(H, W) px, NaN without a surface; and the truth's visible and calm."""
+    """(H, W) px, NaN without a surface; and the visible and calm of the ground truth."""
     mapped, visible, calm = find_truth(pair, size_wh)
-    found = map_pixels(*relate_depths(*read_views(folders, pair, size_wh), size_wh))
-    return np.linalg.norm(found - mapped, axis=-1), visible, calm
+    actual = map_pixels(*relate_depths(*read_views(folders, pair, size_wh), size_wh))
+    return np.linalg.norm(actual - mapped, axis=-1), visible, calm
 
 
 @pytest.mark.parametrize("pair", ALL_PAIRS)
@@ -323,7 +323,7 @@ def test_patches_are_supervised_by_the_blocks(folders):
     b_from_a, surface = relate_depths(*read_views(folders, (0, 1), size_wh), size_wh)
     mapped, _, calm = find_truth((0, 1), size_wh)
     fine = LightBackbone.fine_grid
-    truth = draw_patches(
+    supervision = draw_patches(
         torch.tensor(b_from_a)[None],
         torch.tensor(surface)[None],
         400,
@@ -332,15 +332,15 @@ def test_patches_are_supervised_by_the_blocks(folders):
         4.0,
         torch.Generator().manual_seed(0),
     )
-    centre0, centre1 = (fine.to_px(cell.double()).numpy() for cell in (truth.cell0, truth.cell1))
-    moved = truth.homography[:, :2, 2] / truth.homography[:, 2:, 2]
-    found = centre1 + 2 * moved.numpy()
+    centre0, centre1 = (fine.to_px(cell.double()).numpy() for cell in (supervision.cell0, supervision.cell1))
+    moved = supervision.homography[:, :2, 2] / supervision.homography[:, 2:, 2]
+    actual = centre1 + 2 * moved.numpy()
     checked = 0
-    for i in truth.correct.nonzero().flatten().tolist():
+    for i in supervision.correct.nonzero().flatten().tolist():
         # A patch's centre is a corner of four pixels.
         x, y = centre0[i].astype(int)
         if calm[y - 1 : y + 1, x - 1 : x + 1].all():
-            np.testing.assert_allclose(found[i], mapped[y - 1 : y + 1, x - 1 : x + 1].mean(axis=(0, 1)), atol=0.1)
+            np.testing.assert_allclose(actual[i], mapped[y - 1 : y + 1, x - 1 : x + 1].mean(axis=(0, 1)), atol=0.1)
             checked += 1
     assert checked > 20
 
@@ -360,11 +360,11 @@ def test_pairs_are_chosen_by_overlap(folders, overlap, expected):
     def number(path):
         return int(Path(path).stem)
 
-    found = [
+    actual = [
         {tuple(number(scene.image_paths[i]) for i in pair) for pair in scene.pairs}
         for scene in load_scenes(*folders, overlap)
     ]
-    assert found == expected
+    assert actual == expected
 
 
 def test_photos_that_no_pair_names_are_left_out(folders):

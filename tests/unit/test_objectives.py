@@ -25,7 +25,7 @@ CENTRE = torch.zeros(1, 2)
 GRIDS = LightBackbone.coarse_grid, LightBackbone.fine_grid
 
 
-def make_truth() -> PatchSupervision:
+def make_supervision() -> PatchSupervision:
     """Six patches that do not move."""
     where = torch.zeros(6, 2, dtype=torch.int64)
     shift = torch.zeros(6, 4, 2)
@@ -45,17 +45,19 @@ def turn_corners(degrees: float) -> torch.Tensor:
 
 
 def test_centre_supervision_knows_the_centre_only():
-    truth, turned = make_truth(), make_estimate(turn_corners(20.0))
-    assert measure_errors(turned, truth, dense=False).shape == (6, 1)
-    assert measure_errors(turned, truth, dense=False).max() < 1e-5
-    assert measure_errors(turned, truth).max() > 0.1
-    parts = measure_loss([turned], truth, HALF, dense=False)
+    supervision, turned = make_supervision(), make_estimate(turn_corners(20.0))
+    assert measure_errors(turned, supervision, dense=False).shape == (6, 1)
+    assert measure_errors(turned, supervision, dense=False).max() < 1e-5
+    assert measure_errors(turned, supervision).max() > 0.1
+    parts = measure_loss([turned], supervision, HALF, dense=False)
     assert parts["dense"] < 1e-5
     torch.testing.assert_close(parts["loss"], SCALE_WEIGHT * parts["scale"], atol=1e-5, rtol=0)
-    assert measure_loss([turned], truth, HALF)["loss"] > parts["loss"] + 0.1
+    assert measure_loss([turned], supervision, HALF)["loss"] > parts["loss"] + 0.1
     moved = make_estimate(torch.full((6, 4, 2), 0.5))
-    torch.testing.assert_close(measure_errors(moved, truth, dense=False), torch.full((6, 1), 0.5**0.5))
-    torch.testing.assert_close(measure_loss([moved], truth, HALF, dense=False)["dense"], torch.tensor(0.5**0.5 / HALF))
+    torch.testing.assert_close(measure_errors(moved, supervision, dense=False), torch.full((6, 1), 0.5**0.5))
+    torch.testing.assert_close(
+        measure_loss([moved], supervision, HALF, dense=False)["dense"], torch.tensor(0.5**0.5 / HALF)
+    )
 
 
 def make_batch(size_px: int = 64) -> dict[str, torch.Tensor]:
@@ -95,8 +97,8 @@ def test_points_of_real_photos_are_not_shifted_either():
     apart = []
     for share in (0.0, 0.5):
         generator = torch.Generator().manual_seed(4)
-        truth = draw_point_patches(points, (256, 256), 300, *GRIDS, HALF, generator, share)
-        apart.append((truth.cell0 - truth.cell1)[truth.correct].abs().amax(dim=1))
+        supervision = draw_point_patches(points, (256, 256), 300, *GRIDS, HALF, generator, share)
+        apart.append((supervision.cell0 - supervision.cell1)[supervision.correct].abs().amax(dim=1))
     assert len(apart[0]) > 200 and apart[0].max() == 0
     assert (apart[1] == 4).float().mean() > 0.3
 

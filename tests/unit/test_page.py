@@ -105,8 +105,8 @@ def test_data_of_the_view_comes_back_bit_for_bit():
         ("colours", "u1", report.scene.rgb),
         ("frusta", "<f4", report.scene.frusta),
     ):
-        found = np.frombuffer(base64.b64decode(data[field]), dtype).reshape(expected.shape)
-        np.testing.assert_array_equal(found, expected)
+        actual = np.frombuffer(base64.b64decode(data[field]), dtype).reshape(expected.shape)
+        np.testing.assert_array_equal(actual, expected)
 
 
 def test_names_cannot_break_the_page():

@@ -123,10 +123,10 @@ def test_they_train_as_one_process_does(several, shared):
 def test_the_fine_stage_learns_from_all_processes(several, shared):
     """Its patches and batch norms depend on the number of processes, the loss of the coarse stage does not."""
     path = train(dataclasses.replace(several, stage="joint"), quiet=True)
-    found, expected = (read_losses(folder / "log.csv", "coarse") for folder in (shared / "joint", path.parent))
-    assert found[0] == pytest.approx(expected[0], rel=1e-4)
-    found, expected = (read_losses(folder / "log.csv") for folder in (shared / "joint", path.parent))
-    np.testing.assert_allclose(found, expected, rtol=0.2)
+    actual, expected = (read_losses(folder / "log.csv", "coarse") for folder in (shared / "joint", path.parent))
+    assert actual[0] == pytest.approx(expected[0], rel=1e-4)
+    actual, expected = (read_losses(folder / "log.csv") for folder in (shared / "joint", path.parent))
+    np.testing.assert_allclose(actual, expected, rtol=0.2)
     before = loop.make_state(dataclasses.replace(several, stage="joint"), torch.device("cpu")).net.state_dict()
     after = torch.load(shared / "joint-0.pt")
     assert not torch.equal(before["backbone.fine.stem.1.running_mean"], after["backbone.fine.stem.1.running_mean"])

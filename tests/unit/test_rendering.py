@@ -216,11 +216,11 @@ def test_demo_files_hold_the_cameras_they_were_rendered_with(tmp_path, monkeypat
     monkeypatch.setattr(hm_sfm.synthetic.demo, "make_demo_scene", lambda seed: scene)
     views = write_demo(tmp_path / "a", seed=0, count=3, size_wh=(160, 120))
     assert list(views) == ["view_00.jpg", "view_01.jpg", "view_02.jpg"]
-    truth = read_strecha_cameras(tmp_path / "a" / "ground_truth")
-    assert list(truth) == list(views)
+    ground_truth = read_strecha_cameras(tmp_path / "a" / "ground_truth")
+    assert list(ground_truth) == list(views)
     for name, view in views.items():
-        np.testing.assert_allclose(truth[name].cam_from_world, view.cam_from_world, atol=1e-12)
-        np.testing.assert_allclose(truth[name].K, view.K, atol=1e-9)
+        np.testing.assert_allclose(ground_truth[name].cam_from_world, view.cam_from_world, atol=1e-12)
+        np.testing.assert_allclose(ground_truth[name].K, view.K, atol=1e-9)
         camera = pycolmap.infer_camera_from_image(tmp_path / "a" / "images" / name)
         assert camera.has_prior_focal_length and (camera.width, camera.height) == view.size_wh
         np.testing.assert_allclose(camera.calibration_matrix(), view.K, atol=1e-6)

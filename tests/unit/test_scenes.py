@@ -101,9 +101,9 @@ def test_surfaces_are_those_that_rays_hit_in_both_views(photos, seed):
             if not shown or cast_ray(facets, views[1].center, there)[1] < 1 - 1e-5:
                 index = -1
         expected.append(index)
-    found = surface[rows, columns]
-    assert np.array_equal(found, expected)
-    assert len(np.unique(found)) > 5 and 0.1 < (found >= 0).mean() < 0.95
+    actual = surface[rows, columns]
+    assert np.array_equal(actual, expected)
+    assert len(np.unique(actual)) > 5 and 0.1 < (actual >= 0).mean() < 0.95
 
 
 def test_what_hides_behind_a_board_has_no_partner():
@@ -149,8 +149,8 @@ def test_a_dot_of_the_texture_appears_where_its_point_projects(depth):
     u, v = texel / (140, 100)
     expected, _ = VIEW.project((facet.origin + u * facet.edge_u + v * facet.edge_v)[None])
     rows, columns = np.mgrid[: SIZE_WH[1], : SIZE_WH[0]] + 0.5
-    found = np.array([(image * columns).sum(), (image * rows).sum()]) / image.sum()
-    np.testing.assert_allclose(found, expected[0], atol=0.06)
+    actual = np.array([(image * columns).sum(), (image * rows).sum()]) / image.sum()
+    np.testing.assert_allclose(actual, expected[0], atol=0.06)
 
 
 def test_repeated_photos_are_mirrored():
@@ -240,9 +240,9 @@ def test_a_relief_is_one_surface_under_one_photo(photos):
         vertex = tuple((facet.origin + u * facet.edge_u + v * facet.edge_v).round(9))
         texels.setdefault(vertex, []).append(facet.texel_from_uv @ (u, v, 1))
     assert len(facets) == 40 and len(texels) == 30
-    assert all(np.allclose(found, found[0]) for found in texels.values())
+    assert all(np.allclose(actual, actual[0]) for actual in texels.values())
     height, width = photos[0].shape
-    corners = np.array([found[0] for found in texels.values()])
+    corners = np.array([actual[0] for actual in texels.values()])
     assert corners[:, 0].max() == pytest.approx(width * facets[0].texture.copies)
     assert corners[:, 1].max() == pytest.approx(height * facets[0].texture.copies)
     normals = np.array([facet.normal for facet in facets])
@@ -280,14 +280,14 @@ def test_patches_of_scenes_follow_their_own_surface(photos):
     item = RenderedScenes(photos, (96, 96), 7, 10, views)[2]
     b_from_a, surface = torch.tensor(item["b_from_a"])[None], torch.tensor(item["surface"])[None]
     coarse, fine = LightBackbone.coarse_grid, LightBackbone.fine_grid
-    truth = draw_patches(b_from_a, surface, 600, coarse, fine, 4.0, torch.Generator().manual_seed(0))
-    assert truth.correct.sum() > 50
-    for i in truth.correct.nonzero().flatten().tolist()[:40]:
+    supervision = draw_patches(b_from_a, surface, 600, coarse, fine, 4.0, torch.Generator().manual_seed(0))
+    assert supervision.correct.sum() > 50
+    for i in supervision.correct.nonzero().flatten().tolist()[:40]:
         # The patch centre is one px right of and below the coarse cell's centre, which is what must be shown.
-        centre_px = fine.to_px(truth.cell0[i].double()).numpy()
+        centre_px = fine.to_px(supervision.cell0[i].double()).numpy()
         index = item["surface"][tuple((centre_px - 1).astype(int)[::-1])]
         assert index >= 0
         expected = map_points(item["b_from_a"][index].astype(float), centre_px[None])[0]
-        moved = truth.homography[i, :2, 2] / truth.homography[i, 2, 2]
-        found = fine.to_px(truth.cell1[i].double()).numpy() + 2 * moved.numpy()
-        np.testing.assert_allclose(found, expected, atol=0.02)
+        moved = supervision.homography[i, :2, 2] / supervision.homography[i, 2, 2]
+        actual = fine.to_px(supervision.cell1[i].double()).numpy() + 2 * moved.numpy()
+        np.testing.assert_allclose(actual, expected, atol=0.02)

@@ -1,4 +1,4 @@
-"""What the truth of a training pair is, for both stages, and the losses that compare with it."""
+"""The supervision of a training pair, for both stages, and the losses that compare with it."""
 
 import dataclasses
 import math
@@ -49,38 +49,38 @@ def draw(b_from_a: np.ndarray, seed: int = 0, per_pair: int = 400) -> PatchSuper
 
 def test_patches_hold_the_truth():
     b_from_a = np.array([[[1.1, -0.1, 9.0], [0.12, 0.95, -14.0], [1e-4, 2e-4, 1.0]], np.eye(3)])
-    truth = draw(b_from_a)
-    assert 400 < len(truth.cell0) <= 800
+    supervision = draw(b_from_a)
+    assert 400 < len(supervision.cell0) <= 800
     points = torch.tensor([[0.0, 0.0], [-4.0, 4.0], [2.5, 1.0]])
-    in_patch = apply_homography(truth.homography, points).double().numpy()
+    in_patch = apply_homography(supervision.homography, points).double().numpy()
     for matrix in range(2):
-        mine = (truth.image_index == matrix).numpy()
-        px0 = FINE.to_px(truth.cell0.numpy()[mine][:, None] + points.numpy())
-        px1 = FINE.to_px(truth.cell1.numpy()[mine][:, None] + in_patch[mine])
+        mine = (supervision.image_index == matrix).numpy()
+        px0 = FINE.to_px(supervision.cell0.numpy()[mine][:, None] + points.numpy())
+        px1 = FINE.to_px(supervision.cell1.numpy()[mine][:, None] + in_patch[mine])
         np.testing.assert_allclose(px1, map_points(b_from_a[matrix], px0), atol=0.01)
     corners = make_corners(HALF)
-    moved = apply_homography(homography_from_corners(truth.displacement, HALF), corners)
-    correct = truth.correct
+    moved = apply_homography(homography_from_corners(supervision.displacement, HALF), corners)
+    correct = supervision.correct
     torch.testing.assert_close(
-        moved[correct], apply_homography(truth.homography, corners)[correct], atol=1e-3, rtol=1e-3
+        moved[correct], apply_homography(supervision.homography, corners)[correct], atol=1e-3, rtol=1e-3
     )
 
 
 def test_most_patches_are_within_reach_and_some_are_wrong():
-    truth = draw(np.eye(3))
-    apart = apply_homography(truth.homography, torch.zeros(1, 2))[:, 0].norm(dim=1)
-    assert 0.85 < truth.correct.float().mean() < 0.97
-    assert (apart[truth.correct] <= 4 * 2**0.5 + 1e-3).all()
+    supervision = draw(np.eye(3))
+    apart = apply_homography(supervision.homography, torch.zeros(1, 2))[:, 0].norm(dim=1)
+    assert 0.85 < supervision.correct.float().mean() < 0.97
+    assert (apart[supervision.correct] <= 4 * 2**0.5 + 1e-3).all()
     exact = (apart < 1e-3).float().mean()
     assert 0.6 < exact < 0.8
-    assert apart[~truth.correct].median() > 20
+    assert apart[~supervision.correct].median() > 20
 
 
 def test_patches_without_partner_are_left_out():
     far = np.array([[1, 0, 128.0], [0, 1, 0], [0, 0, 1]])
-    truth = draw(far)
-    assert len(truth.cell0) > 50
-    assert (FINE.to_px(truth.cell0[:, 0]) < 132).all()
+    supervision = draw(far)
+    assert len(supervision.cell0) > 50
+    assert (FINE.to_px(supervision.cell0[:, 0]) < 132).all()
     away = draw(np.array([[1, 0, 1000.0], [0, 1, 0], [0, 0, 1]]))
     assert len(away.cell0) == 0
 
@@ -90,7 +90,7 @@ def test_the_same_generator_draws_the_same_patches():
     assert torch.equal(one.cell1, other.cell1) and not torch.equal(one.cell1[:100], third.cell1[:100])
 
 
-def make_truth(count: int = 6) -> PatchSupervision:
+def make_supervision(count: int = 6) -> PatchSupervision:
     displacement = torch.randn(count, 4, 2, generator=torch.Generator().manual_seed(0)) * 0.5
     cells = torch.zeros(count, 2, dtype=torch.int64)
     return PatchSupervision(
@@ -106,79 +106,85 @@ def make_estimate(displacement: torch.Tensor, log_scale: float = 0.0) -> FineEst
 
 
 def test_the_truth_has_no_error():
-    truth = make_truth()
-    estimate = make_estimate(truth.displacement)
-    assert measure_errors(estimate, truth).shape == (6, 81)
-    assert measure_errors(estimate, truth).max() < 1e-4
-    parts = measure_loss([estimate], truth, HALF)
+    supervision = make_supervision()
+    estimate = make_estimate(supervision.displacement)
+    assert measure_errors(estimate, supervision).shape == (6, 81)
+    assert measure_errors(estimate, supervision).max() < 1e-4
+    parts = measure_loss([estimate], supervision, HALF)
     assert parts["dense"] < 1e-4 and parts["corner"] < 1e-4
 
 
 def test_errors_are_distances_in_cells():
-    truth = make_truth()
-    shifted = dataclasses.replace(make_estimate(truth.displacement), homography=truth.homography.clone())
-    shifted.homography[:, 0] += 3 * truth.homography[:, 2]
-    shifted.homography[:, 1] += 4 * truth.homography[:, 2]
-    torch.testing.assert_close(measure_errors(shifted, truth), torch.full((6, 81), 5.0))
+    supervision = make_supervision()
+    shifted = dataclasses.replace(make_estimate(supervision.displacement), homography=supervision.homography.clone())
+    shifted.homography[:, 0] += 3 * supervision.homography[:, 2]
+    shifted.homography[:, 1] += 4 * supervision.homography[:, 2]
+    torch.testing.assert_close(measure_errors(shifted, supervision), torch.full((6, 81), 5.0))
 
 
 def test_the_loss_prefers_the_better_estimate_and_the_later_iteration():
-    truth = make_truth()
-    good, bad = make_estimate(truth.displacement + 0.1), make_estimate(truth.displacement + 1.0)
-    losses = [measure_loss(estimates, truth, HALF)["loss"] for estimates in ([good], [bad], [bad, good], [good, bad])]
+    supervision = make_supervision()
+    good, bad = make_estimate(supervision.displacement + 0.1), make_estimate(supervision.displacement + 1.0)
+    losses = [
+        measure_loss(estimates, supervision, HALF)["loss"] for estimates in ([good], [bad], [bad, good], [good, bad])
+    ]
     assert losses[0] < losses[1] and losses[2] < losses[3]
 
 
 def test_the_error_scale_is_best_at_the_error_itself():
-    truth = make_truth()
+    supervision = make_supervision()
     # A plain shift of the corners is not quite one of the dense points: the scale is taught their mean distance.
-    error = measure_errors(make_estimate(truth.displacement + 0.5), truth).mean()
+    error = measure_errors(make_estimate(supervision.displacement + 0.5), supervision).mean()
     scales = [
-        measure_loss([make_estimate(truth.displacement + 0.5, float(error.log()) + off)], truth, HALF)["scale"]
+        measure_loss([make_estimate(supervision.displacement + 0.5, float(error.log()) + off)], supervision, HALF)[
+            "scale"
+        ]
         for off in (-1.0, 0.0, 1.0)
     ]
     assert scales[1] < min(scales[0], scales[2])
 
 
 def test_wrong_and_folded_patches_teach_no_dense_points():
-    truth = make_truth()
-    folded = truth.displacement.clone()
+    supervision = make_supervision()
+    folded = supervision.displacement.clone()
     folded[0] += torch.tensor([[8.0, 0], [-8.0, 0], [8.0, 0], [-8.0, 0]])
     estimate = make_estimate(folded)
-    assert measure_loss([estimate], truth, HALF)["dense"] < 1e-4
-    assert measure_loss([estimate], truth, HALF)["corner"] > 0.1
-    wrong = dataclasses.replace(truth, correct=torch.zeros(6, dtype=torch.bool))
-    parts = measure_loss([make_estimate(truth.displacement + 1)], wrong, HALF)
+    assert measure_loss([estimate], supervision, HALF)["dense"] < 1e-4
+    assert measure_loss([estimate], supervision, HALF)["corner"] > 0.1
+    wrong = dataclasses.replace(supervision, correct=torch.zeros(6, dtype=torch.bool))
+    parts = measure_loss([make_estimate(supervision.displacement + 1)], wrong, HALF)
     assert parts["dense"] == 0 and parts["corner"] == 0 and parts["scale"] > 1
 
 
 def test_without_patches_there_is_nothing_to_learn():
-    truth = make_truth(0)
+    supervision = make_supervision(0)
     estimate = make_estimate(torch.zeros(0, 4, 2))
-    assert all(value == 0 for value in measure_loss([estimate, estimate], truth, HALF).values())
+    assert all(value == 0 for value in measure_loss([estimate, estimate], supervision, HALF).values())
 
 
 def test_the_centre_alone_can_supervise():
-    truth = make_truth()
-    errors = measure_errors(make_estimate(truth.displacement + 0.5), truth, dense=False)
+    supervision = make_supervision()
+    errors = measure_errors(make_estimate(supervision.displacement + 0.5), supervision, dense=False)
     assert errors.shape == (6, 1)
     centre = torch.zeros(1, 2)
-    moved = apply_homography(make_estimate(truth.displacement + 0.5).homography, centre)
-    torch.testing.assert_close(errors, (moved - apply_homography(truth.homography, centre)).norm(dim=-1))
+    moved = apply_homography(make_estimate(supervision.displacement + 0.5).homography, centre)
+    torch.testing.assert_close(errors, (moved - apply_homography(supervision.homography, centre)).norm(dim=-1))
     # Turned and stretched about the right centre: only the dense points know better.
     turned = torch.eye(3).repeat(6, 1, 1)
     turned[:, :2, :2] = torch.tensor([[0.8, -0.6], [0.6, 0.8]]) * 1.3
-    estimate = dataclasses.replace(make_estimate(truth.displacement + 0.5), homography=truth.homography @ turned)
-    parts = measure_loss([estimate], truth, HALF, dense=False)
-    assert parts["dense"] < 1e-4 and measure_loss([estimate], truth, HALF)["dense"] > 0.1
+    estimate = dataclasses.replace(
+        make_estimate(supervision.displacement + 0.5), homography=supervision.homography @ turned
+    )
+    parts = measure_loss([estimate], supervision, HALF, dense=False)
+    assert parts["dense"] < 1e-4 and measure_loss([estimate], supervision, HALF)["dense"] > 0.1
     assert parts["corner"] > 0 and parts["loss"] < parts["corner"] * 1e-3 + parts["scale"]
 
 
 def test_without_suppressed_patches_none_is_a_cell_off():
     matrix, surface = torch.eye(3).repeat(1, 1, 1, 1), torch.zeros(1, 256, 256, dtype=torch.int64)
-    truth = draw_patches(matrix, surface, 400, COARSE, FINE, HALF, torch.Generator().manual_seed(0), 0.0)
-    apart = apply_homography(truth.homography, torch.zeros(1, 2))[:, 0].norm(dim=1)
-    assert (apart[truth.correct] < 1e-3).float().mean() > 0.98 and (~truth.correct).any()
+    supervision = draw_patches(matrix, surface, 400, COARSE, FINE, HALF, torch.Generator().manual_seed(0), 0.0)
+    apart = apply_homography(supervision.homography, torch.zeros(1, 2))[:, 0].norm(dim=1)
+    assert (apart[supervision.correct] < 1e-3).float().mean() > 0.98 and (~supervision.correct).any()
 
 
 # Patches of which one point is known
@@ -203,24 +209,27 @@ def points() -> torch.Tensor:
 
 
 def test_points_stay_where_they_are_relative_to_their_patches(points):
-    truth = draw_points(points)
-    assert truth.cell0.dtype == truth.cell1.dtype == torch.int64
-    px0, px1 = (FINE.to_px(cell + point) for cell, point in ((truth.cell0, truth.point0), (truth.cell1, truth.point1)))
-    shift = torch.where(truth.image_index == 0, 20.0, 30.0)
+    supervision = draw_points(points)
+    assert supervision.cell0.dtype == supervision.cell1.dtype == torch.int64
+    px0, px1 = (
+        FINE.to_px(cell + point)
+        for cell, point in ((supervision.cell0, supervision.point0), (supervision.cell1, supervision.point1))
+    )
+    shift = torch.where(supervision.image_index == 0, 20.0, 30.0)
     torch.testing.assert_close(px1 - px0, torch.stack([shift, torch.zeros(len(shift))], dim=1), atol=1e-3, rtol=0)
-    given = points[truth.image_index, :, :2]
+    given = points[supervision.image_index, :, :2]
     assert ((given - px0[:, None]).abs().amax(dim=2) < 1e-3).any(dim=1).all()
     # A cell holds its points: they are no farther from its centre than half a cell, and the fine cell next to it.
-    assert truth.point0.abs().max() <= 2 + 0.5 + 1e-4
-    assert (truth.image_index == 0).sum() > 250 and 80 < (truth.image_index == 1).sum() <= 100
+    assert supervision.point0.abs().max() <= 2 + 0.5 + 1e-4
+    assert (supervision.image_index == 0).sum() > 250 and 80 < (supervision.image_index == 1).sum() <= 100
 
 
 def test_most_points_are_within_reach_and_some_are_wrong(points):
-    truth = draw_points(points)
-    apart = (truth.point1 - truth.point0).abs().amax(dim=1)
-    assert 0.85 < truth.correct.float().mean() < 0.97
-    assert apart[truth.correct].max() < 2 * HALF and apart[~truth.correct].median() > 2 * HALF
-    beyond = truth.point1[truth.correct].abs().amax(dim=1) > 2.5 + 1e-4
+    supervision = draw_points(points)
+    apart = (supervision.point1 - supervision.point0).abs().amax(dim=1)
+    assert 0.85 < supervision.correct.float().mean() < 0.97
+    assert apart[supervision.correct].max() < 2 * HALF and apart[~supervision.correct].median() > 2 * HALF
+    beyond = supervision.point1[supervision.correct].abs().amax(dim=1) > 2.5 + 1e-4
     assert 0.1 < beyond.float().mean() < 0.4
     unshifted = draw_points(points, jittered_share=0.0)
     assert unshifted.point1[unshifted.correct].abs().max() <= 2.5 + 1e-4
@@ -234,9 +243,9 @@ def test_points_that_are_not_there_give_no_patches(points):
     assert torch.equal(one.point1, other.point1) and not torch.equal(one.point0[:50], third.point0[:50])
 
 
-def make_point_truth(count: int = 6, off: float = 0.0) -> tuple[FineEstimate, PointSupervision]:
+def make_point_supervision(count: int = 6, off: float = 0.0) -> tuple[FineEstimate, PointSupervision]:
     """An estimate, and points that lie `off` cells beside what it says."""
-    estimate = make_estimate(make_truth(count).displacement)
+    estimate = make_estimate(make_supervision(count).displacement)
     point0 = torch.linspace(-2, 2, 2 * count).view(count, 2)
     point1 = apply_homography(estimate.homography, point0[:, None])[:, 0] + torch.tensor([0.0, off])
     cells = torch.zeros(count, 2, dtype=torch.int64)
@@ -244,27 +253,27 @@ def make_point_truth(count: int = 6, off: float = 0.0) -> tuple[FineEstimate, Po
 
 
 def test_points_as_far_off_as_their_teachers_are_no_error():
-    losses = [measure_point_loss([e], t, HALF).item() for e, t in map(make_point_truth, [6] * 3, (0, 0.9, 1.9))]
-    near = [measure_point_loss([e], t, HALF).item() for e, t in [make_point_truth(6, 0.9 * TEACHER_ERROR)]]
+    losses = [measure_point_loss([e], t, HALF).item() for e, t in map(make_point_supervision, [6] * 3, (0, 0.9, 1.9))]
+    near = [measure_point_loss([e], t, HALF).item() for e, t in [make_point_supervision(6, 0.9 * TEACHER_ERROR)]]
     assert near == pytest.approx(losses[:1])
     assert losses[0] < losses[1] < losses[2]
 
 
 def test_wrong_points_teach_the_error_scale_only():
-    estimate, truth = make_point_truth(off=3.0)
-    wrong = dataclasses.replace(truth, correct=torch.zeros(6, dtype=torch.bool))
+    estimate, supervision = make_point_supervision(off=3.0)
+    wrong = dataclasses.replace(supervision, correct=torch.zeros(6, dtype=torch.bool))
     log_scale = torch.zeros(6, requires_grad=True)
     homography = estimate.homography.clone().requires_grad_()
     estimate = dataclasses.replace(estimate, homography=homography, log_scale=log_scale)
     measure_point_loss([estimate], wrong, HALF).backward()
     assert not homography.grad.any() and (log_scale.grad < 0).all()
-    measure_point_loss([estimate], truth, HALF).backward()
+    measure_point_loss([estimate], supervision, HALF).backward()
     assert homography.grad.any()
 
 
 def test_without_points_there_is_nothing_to_learn():
-    estimate, truth = make_point_truth(0)
-    assert measure_point_loss([estimate], truth, HALF) == measure_point_loss([], truth, HALF) == 0
+    estimate, supervision = make_point_supervision(0)
+    assert measure_point_loss([estimate], supervision, HALF) == measure_point_loss([], supervision, HALF) == 0
 
 
 # Matches and the loss of the coarse stage
@@ -278,9 +287,9 @@ NOWHERE = torch.full((1, 48, 64), -1)
 def find_matches(points: list[tuple[float, ...]], grid: Grid = COARSE) -> list[tuple[int, int]]:
     """Cell pairs of one pair of 64 x 48 px that is known by its points only."""
     given = torch.tensor(points, dtype=torch.float32).reshape(1, -1, 4)
-    found = find_coarse_matches(torch.eye(3).repeat(1, 1, 1, 1), NOWHERE, given, grid)
-    assert not found.image_index.any()
-    return sorted(zip(found.index0.tolist(), found.index1.tolist()))
+    actual = find_coarse_matches(torch.eye(3).repeat(1, 1, 1, 1), NOWHERE, given, grid)
+    assert not actual.image_index.any()
+    return sorted(zip(actual.index0.tolist(), actual.index1.tolist()))
 
 
 def find_matches_naively(b_from_a, surface, points, grid) -> set[tuple[int, int, int]]:
@@ -328,8 +337,8 @@ def test_coarse_matches_equal_a_naive_loop(name):
     points = torch.tensor(rng.uniform(-10, 75, (3, 150, 4)), dtype=torch.float32)
     points[:, ::3] = torch.nan
     points[2] = torch.nan
-    found = find_coarse_matches(b_from_a, surface, points, GRIDS[name])
-    triples = list(zip(found.image_index.tolist(), found.index0.tolist(), found.index1.tolist()))
+    actual = find_coarse_matches(b_from_a, surface, points, GRIDS[name])
+    triples = list(zip(actual.image_index.tolist(), actual.index0.tolist(), actual.index1.tolist()))
     assert set(triples) == find_matches_naively(b_from_a, surface, points, GRIDS[name])
     assert [sum(item == i for item, _, _ in triples) > 10 for i in range(3)] == [True] * 3
     for columns in ((0, 1), (0, 2)):
@@ -369,9 +378,9 @@ def test_points_that_are_not_there_count_for_nothing():
 
 
 def test_every_cell_of_equal_views_matches_itself():
-    found = find_coarse_matches(torch.eye(3).repeat(1, 1, 1, 1), torch.zeros(1, 48, 64).long(), NO_POINTS, COARSE)
-    assert sorted(found.index0.tolist()) == list(range(48))
-    assert torch.equal(found.index0, found.index1)
+    actual = find_coarse_matches(torch.eye(3).repeat(1, 1, 1, 1), torch.zeros(1, 48, 64).long(), NO_POINTS, COARSE)
+    assert sorted(actual.index0.tolist()) == list(range(48))
+    assert torch.equal(actual.index0, actual.index1)
 
 
 def make_cells(generator_seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -396,7 +405,7 @@ def measure_densely(coarse0, coarse1, sharpness, matches: list[list[tuple[int, i
     return float(np.mean(means))
 
 
-def make_coarse_truth(matches: list[list[tuple[int, int]]]) -> CoarseSupervision:
+def make_coarse_supervision(matches: list[list[tuple[int, int]]]) -> CoarseSupervision:
     rows = [(item, i, j) for item, pairs in enumerate(matches) for i, j in pairs]
     return CoarseSupervision(*torch.tensor(rows, dtype=torch.int64).reshape(-1, 3).unbind(dim=1))
 
@@ -410,14 +419,14 @@ def make_coarse_truth(matches: list[list[tuple[int, int]]]) -> CoarseSupervision
 )
 def test_the_coarse_loss_equals_that_of_whole_matrices(matches):
     coarse0, coarse1 = make_cells()
-    found = measure_coarse_loss(coarse0, coarse1, torch.tensor(1.7), make_coarse_truth(matches))
-    assert found.item() == pytest.approx(measure_densely(coarse0, coarse1, 1.7, matches), rel=1e-5)
+    actual = measure_coarse_loss(coarse0, coarse1, torch.tensor(1.7), make_coarse_supervision(matches))
+    assert actual.item() == pytest.approx(measure_densely(coarse0, coarse1, 1.7, matches), rel=1e-5)
 
 
 def test_pairs_without_matches_teach_nothing_and_break_nothing():
     coarse0, coarse1 = make_cells()
     coarse0.requires_grad_()
-    loss = measure_coarse_loss(coarse0, coarse1, torch.tensor(1.7), make_coarse_truth([[], [], []]))
+    loss = measure_coarse_loss(coarse0, coarse1, torch.tensor(1.7), make_coarse_supervision([[], [], []]))
     loss.backward()
     assert loss == 0 and not coarse0.grad.any()
 
@@ -427,5 +436,5 @@ def test_many_matches_are_thinned_evenly(monkeypatch):
     coarse0, coarse1 = make_cells()
     matches = [[(i, 9 - i) for i in range(10)], [(0, 0), (1, 1), (2, 2)], []]
     thinned = [matches[0][::3], matches[1], []]
-    found = measure_coarse_loss(coarse0, coarse1, torch.tensor(1.7), make_coarse_truth(matches))
-    assert found.item() == pytest.approx(measure_densely(coarse0, coarse1, 1.7, thinned), rel=1e-5)
+    actual = measure_coarse_loss(coarse0, coarse1, torch.tensor(1.7), make_coarse_supervision(matches))
+    assert actual.item() == pytest.approx(measure_densely(coarse0, coarse1, 1.7, thinned), rel=1e-5)

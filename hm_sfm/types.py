@@ -8,7 +8,7 @@ Arrays are copied and made read-only on creation; shape and dtype are checked. M
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -266,3 +266,11 @@ class MappingResult:
     mean_track_length: float
     """In distinct images."""
     mean_reprojection_px: float
+
+
+class TrainingPairs(Protocol):
+    """Training pairs of one kind: an item is made when it is asked for, the same one each time."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int, /) -> dict[str, np.ndarray]: ...

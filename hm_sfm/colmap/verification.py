@@ -15,7 +15,7 @@ from tqdm import tqdm
 from hm_sfm.colmap.database import open_database
 from hm_sfm.config import VerificationConfig
 from hm_sfm.io.colmap_log import quiet_colmap
-from hm_sfm.types import ImagePair, ImageRef, PairMatches, freeze_array
+from hm_sfm.types import ImagePair, ImageRef, PairMatches, PatchMatches, freeze_array
 
 # Fewer matches than this prove nothing about an epipolar geometry.
 MIN_MATCHES = 8
@@ -56,7 +56,7 @@ def _two_view_options(
 
 
 def verify_pair(
-    matches: PairMatches,
+    matches: PatchMatches,
     camera0: pycolmap.Camera,
     camera1: pycolmap.Camera,
     config: VerificationConfig,

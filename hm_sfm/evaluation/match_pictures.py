@@ -1,6 +1,5 @@
 """Pictures of the matches that an evaluation looks at, coloured by their errors against the ground truth."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,8 +28,8 @@ class MatchPictures:
         self.folder = Path(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
 
-    def draw_points(self, images: Sequence[np.ndarray], matches: PatchMatches, error_px: np.ndarray) -> None:
-        """The matches of two grey images (H, W) uint8, error_px (M,) NaN where there is no ground truth."""
+    def draw_points(self, images: np.ndarray, matches: PatchMatches, error_px: np.ndarray) -> None:
+        """The matches of two grey images, (2, H, W) uint8; error_px: (M,) NaN where there is no ground truth."""
         self._write("pair", draw_matches(images[0], images[1], matches.xy0, matches.xy1, error_px))
 
     def draw_poses(self, pair: PosePair, matches: PatchMatches) -> None:
@@ -44,8 +43,8 @@ class MatchPictures:
 
     def _draw_photos(self, path0: Path, path1: Path, matches: PatchMatches, error_px: np.ndarray) -> None:
         """error_px: (M,) px of stored image 1."""
-        photos = [prepare_image(read_ref(path), LONG_EDGE_PX) for path in (path0, path1)]
-        picture = draw_photo_matches(*photos, matches.xy0, matches.xy1, error_px)
+        photo0, photo1 = (prepare_image(read_ref(path), LONG_EDGE_PX) for path in (path0, path1))
+        picture = draw_photo_matches(photo0, photo1, matches.xy0, matches.xy1, error_px)
         self._write(f"{path0.stem}-{path1.stem}", picture)
 
     def _write(self, name: str, picture: np.ndarray) -> None:

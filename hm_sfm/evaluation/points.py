@@ -5,12 +5,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from torch.utils.data import Dataset
 from tqdm import tqdm
 
 from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.types import PatchMatches
+from hm_sfm.types import PatchMatches, TrainingPairs
 
 ERROR_LIMITS_PX = (1, 3, 5)
 CORRECT_LIMITS_PX = (3, 1)
@@ -79,10 +78,10 @@ def measure_points(xy0: np.ndarray, xy1: np.ndarray, b_from_a: np.ndarray, surfa
 
 def score_points(
     matcher: HomoMatcher,
-    pairs: Dataset,
+    pairs: TrainingPairs,
     min_score: float,
     quiet: bool = False,
-    observe: Callable[[Sequence[np.ndarray], PatchMatches, np.ndarray], None] | None = None,
+    observe: Callable[[np.ndarray, PatchMatches, np.ndarray], None] | None = None,
 ) -> dict[str, float]:
     """Match pairs with exact geometry, as training.validation makes them, and measure the errors.
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -53,6 +54,9 @@ class PointMatches:
 
     def __len__(self) -> int:
         return len(self.xy0)
+
+
+Matches = TypeVar("Matches", bound=PatchMatches | PointMatches)
 
 
 def read_strecha_pairs(scene: Path) -> list[PosePair]:
@@ -124,10 +128,10 @@ def score_poses(
 
 
 def score_pose_matches(
-    match: Callable[[Path, Path], PatchMatches | PointMatches],
+    match: Callable[[Path, Path], Matches],
     pairs: Sequence[PosePair],
     quiet: bool = False,
-    observe: Callable[[PosePair, PatchMatches | PointMatches], None] | None = None,
+    observe: Callable[[PosePair, Matches], None] | None = None,
 ) -> dict[str, float]:
     """Match the pairs and estimate their relative poses, by OpenCV's RANSAC as LoFTR does and by COLMAP's LO-RANSAC.
 

@@ -129,7 +129,7 @@ def read_matches(path: Path, pairs: Sequence[ImagePair], keypoints: Sequence[Key
                 f"{path} lacks {len(missing)} of {len(pairs)} pairs, for example {missing[0].name0!r} and "
                 f"{missing[0].name1!r}: it is of another run, or was made from another list of pairs"
             )
-        return tuple(read_pair(h5, path, pair, *group, count_of) for pair, group in zip(pairs, groups))
+        return tuple(read_pair(h5, path, pair, *group, count_of) for pair, group in zip(pairs, groups) if group)
 
 
 def find_group(h5: h5py.File, pair: ImagePair, dataset: str = "matches0") -> tuple[str, bool] | None:

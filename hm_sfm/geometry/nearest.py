@@ -1,6 +1,7 @@
 """Neighbours among points of the plane."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -21,7 +22,7 @@ def find_pairs_within(
     # The tree takes no query that is not finite, or so far away that the square of its distance overflows.
     inside = np.all((queries >= lowest - 2 * radius) & (queries <= highest + 2 * radius), axis=1).nonzero()[0]
     # A bit farther, because the tree rounds distances otherwise.
-    near = KDTree(points).query_ball_point(queries[inside], radius * (1 + 1e-9))
+    near: Any = KDTree(points).query_ball_point(queries[inside], radius * (1 + 1e-9))
     query_index = np.repeat(inside, np.fromiter(map(len, near), np.int64, len(near)))
     point_index = np.fromiter(itertools.chain.from_iterable(near), np.int64, len(query_index))
     offset = queries[query_index].astype(np.float64) - points[point_index]

@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from hm_sfm.matching.interfaces import ImageFeatures
-from hm_sfm.network.backbone import FeatureMaps
+from hm_sfm.network.backbone import FeatureMaps, require_fine
 from hm_sfm.network.device import autocast
 from hm_sfm.network.fine import FineMap, make_fine_map
 from hm_sfm.network.homonet import HomoNet
@@ -87,12 +87,6 @@ class Encoder:
         """Columns and rows of the coarse cells whose centre lies within the image."""
         columns, rows = (self.net.backbone.coarse_grid.count_cells(size) for size in image.scaled_wh)
         return columns, rows
-
-
-def require_fine(maps: FeatureMaps) -> Tensor:
-    """(B, C, H, W): the fine features of maps that were asked for them."""
-    assert maps.fine is not None
-    return maps.fine
 
 
 def pad_image(grey: Tensor, stride: int, standardise: bool) -> Tensor:

@@ -109,6 +109,12 @@ class LightBackbone(nn.Module):
         return FeatureMaps(coarse=eighth, fine=self.fine(image, quarter, eighth) if want_fine else None)
 
 
+def require_fine(maps: FeatureMaps) -> Tensor:
+    """(B, Cf, H/2, W/2): the fine features of maps that were asked for them."""
+    assert maps.fine is not None
+    return maps.fine
+
+
 def load_xfeat(trunk: XFeatTrunk, path: Path) -> None:
     """Start the trunk from XFeat's weights file (its keypoint and matching heads are left out).
 

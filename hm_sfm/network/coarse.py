@@ -170,8 +170,10 @@ def half_precision_factors(device: str) -> Iterator[None]:
 
     Autocast itself would round the products, and make equals of similarities that are not.
     """
-    # PyTorch's own type hints lack the latter.
-    products: Any = torch.backends.cuda.matmul if device == "cuda" else torch.backends.mkldnn.matmul
+    if device == "cuda":
+        products: Any = torch.backends.cuda.matmul
+    else:
+        products = torch.backends.mkldnn.matmul  # pyright: ignore[reportAttributeAccessIssue] PyTorch's hints lack it
     before = products.fp32_precision
     if torch.is_autocast_enabled(device):
         products.fp32_precision = "tf32" if device == "cuda" else "bf16"

@@ -141,7 +141,7 @@ def _pair_similar(
     similar = find_similar(ordered, min(top, len(ordered) - 1), gap)
     return tuple(
         dict.fromkeys(
-            ImagePair.of(ordered[i], ordered[j]) for i, row in enumerate(similar.tolist()) for j in row if j >= 0
+            ImagePair.of(ordered[i], ordered[int(j)]) for i, row in enumerate(similar.tolist()) for j in row if j >= 0
         )
     )
 

@@ -52,10 +52,10 @@ def draw_matches(
     # The worst come last, so that none of them is hidden; the unknown ones come first.
     chosen = chosen[np.argsort(np.nan_to_num(error_px[chosen], nan=-1.0), kind="stable")]
     for i in chosen:
-        colour = pick_colour(error_px[i])
+        colour = pick_colour(float(error_px[i]))
         # OpenCV's drawing counts the centre of the top-left pixel as (0, 0).
         ends = [np.rint((xy - 0.5) * 2**SUBPIXEL_BITS).astype(int).tolist() for xy in (xy0[i], xy1[i] + (shift, 0))]
-        cv2.line(picture, *ends, colour, 1, cv2.LINE_AA, SUBPIXEL_BITS)
+        cv2.line(picture, ends[0], ends[1], colour, 1, cv2.LINE_AA, SUBPIXEL_BITS)
         for end in ends:
             cv2.circle(picture, end, 2 * 2**SUBPIXEL_BITS, colour, cv2.FILLED, cv2.LINE_AA, SUBPIXEL_BITS)
     text = count_errors(error_px) if caption is None else caption

@@ -213,7 +213,7 @@ def lay_out_scene(model: pycolmap.Reconstruction, rotation_deg: Mapping[str, int
     apart = np.linalg.norm(centres[:, None] - centres, axis=2) * scale
     np.fill_diagonal(apart, np.inf)
     depth = float(np.clip(0.4 * np.median(apart.min(axis=1)), 0.02, 0.08))
-    frusta = [outline_camera(model.cameras[image.camera_id], depth / scale) for image in posed]
+    frusta = [outline_camera(model.cameras[image.camera_id], float(depth / scale)) for image in posed]
     corners = np.array([pose * outline for pose, outline in zip(world_from_cam, frusta)]).reshape(-1, 5, 3)
 
     def show(world: np.ndarray) -> np.ndarray:
@@ -254,7 +254,7 @@ def read_baselines(path: Path, num_images: int, config: Config) -> dict[str, dic
             for name, method in methods.items()
         }
         snapped = [name for name in methods if not name.endswith("_raw")]
-        best = max(snapped, key=lambda name: methods[name]["mean_track_length"], default=None)
+        best = max(snapped, key=lambda name: methods[name]["mean_track_length"], default="")
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
     return {name: histograms[name] for name in (f"{BASELINE}_raw", best) if is_same and name in histograms}
@@ -275,8 +275,8 @@ def draw_weak_pairs(
         error_px = np.full(len(chosen), np.nan)
         if pair.name0 in posed and pair.name1 in posed:
             error_px = measure_epipolar_px(model, posed[pair.name0], posed[pair.name1], xy0, xy1)
-        photos = [prepare_image(images[name], WEAK_PAIR_EDGE_PX) for name in (pair.name0, pair.name1)]
-        picture = draw_photo_matches(*photos, xy0, xy1, error_px, caption="")
+        photo0, photo1 = (prepare_image(images[name], WEAK_PAIR_EDGE_PX) for name in (pair.name0, pair.name1))
+        picture = draw_photo_matches(photo0, photo1, xy0, xy1, error_px, caption="")
         _, code = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         drawn.append(WeakPair(pair, len(rows), code.tobytes()))
     return tuple(drawn)
@@ -288,6 +288,6 @@ def measure_epipolar_px(
     """(M,) float64 px: Sampson's distance of matches (M, 2) px from the epipolar geometry of a model's two cameras."""
     cameras = [model.cameras[image.camera_id] for image in (image0, image1)]
     essential = pycolmap.essential_matrix_from_pose(image1.cam_from_world() * image0.cam_from_world().inverse())
-    rays = [camera.cam_from_img(xy) for camera, xy in zip(cameras, (xy0, xy1))]
-    squared = np.array(pycolmap.compute_squared_sampson_error(*rays, essential))
+    rays0, rays1 = (np.asarray(camera.cam_from_img(xy), np.float64) for camera, xy in zip(cameras, (xy0, xy1)))
+    squared = np.array(pycolmap.compute_squared_sampson_error(rays0, rays1, essential))
     return np.sqrt(squared) * np.mean([camera.mean_focal_length() for camera in cameras])

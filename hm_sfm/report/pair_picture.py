@@ -64,9 +64,9 @@ def draw_pair(matcher: HomoMatcher, path_a: Path, path_b: Path, checks: Verifica
     matches = matcher.match(path_a, path_b)
     good = matches.select(matches.score >= checks.min_score)
     # One by one: photos of two folders may have the same name.
-    cameras = [make_cameras([ref], CameraConfig()).cameras[0] for ref in refs]
+    camera_a, camera_b = (make_cameras([ref], CameraConfig()).cameras[0] for ref in refs)
     px_scale = max(1.0, max(max(ref.size_wh) for ref in refs) / matcher.images.long_edge_px)
-    agreeing = verify_pair(good, *cameras, checks, px_scale)
+    agreeing = verify_pair(good, camera_a, camera_b, checks, px_scale)
     count = int(np.count_nonzero(agreeing))
     is_verified = is_convincing(count, len(good), checks)
 

@@ -47,12 +47,16 @@ def make_demo_scene(seed: int = 0) -> tuple[Quad, ...]:
     The same for the same seed; another seed gives other textures, sizes and rotations.
     """
     rng = np.random.default_rng(seed)
+    surfaces = (
+        ((-10, -8, 0), (20, 0, 0), (0, 14.5, 0), "paving", (20, 14.5), 80),
+        ((-6, 5.5, 4.6), (12, 0, 0), (0, 0, -4.6), "bricks", (12, 4.6), 128),
+        ((-6, -0.5, 3.4), (0, 6, 0), (0, 0, -3.4), "plaster", (6, 3.4), 128),
+        ((6, 5.5, 3.9), (0, -5, 0), (0, 0, -3.9), "stones", (5, 3.9), 128),
+        ((-5.0, 3.2, 1.9), (0.9, 1.5, 0), (0.75, -0.45, -1.9), "mural", (1.75, 2.1), 160),
+    )
     quads = [
-        Quad((-10, -8, 0), (20, 0, 0), (0, 14.5, 0), make_texture(rng, "paving", (20, 14.5), 80)),
-        Quad((-6, 5.5, 4.6), (12, 0, 0), (0, 0, -4.6), make_texture(rng, "bricks", (12, 4.6), 128)),
-        Quad((-6, -0.5, 3.4), (0, 6, 0), (0, 0, -3.4), make_texture(rng, "plaster", (6, 3.4), 128)),
-        Quad((6, 5.5, 3.9), (0, -5, 0), (0, 0, -3.9), make_texture(rng, "stones", (5, 3.9), 128)),
-        Quad((-5.0, 3.2, 1.9), (0.9, 1.5, 0), (0.75, -0.45, -1.9), make_texture(rng, "mural", (1.75, 2.1), 160)),
+        Quad(np.array(origin), np.array(edge_u), np.array(edge_v), make_texture(rng, material, size_m, texels_per_m))
+        for origin, edge_u, edge_v, material, size_m, texels_per_m in surfaces
     ]
     for x in (-2.6, 2.2):
         quads += make_box(rng, "stones", (x, 5.3), (0.6, 0.5, rng.uniform(3.6, 4.2)))

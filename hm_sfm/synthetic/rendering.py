@@ -5,6 +5,7 @@ World units are metres, z points up. Pixels are in COLMAP's frame, and so are te
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -17,6 +18,19 @@ AMBIENT, DIFFUSE = 0.50, 0.60
 SAMPLES = 2
 """Colour samples per pixel along each axis. They are symmetric about the pixel's centre, so edges stay unbiased."""
 NEAR_M = 1e-3
+
+
+class Plane(Protocol):
+    """What spans a plane of the world: origin + u * edge_u + v * edge_v, (3,) float64 each."""
+
+    @property
+    def origin(self) -> np.ndarray: ...
+
+    @property
+    def edge_u(self) -> np.ndarray: ...
+
+    @property
+    def edge_v(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -74,14 +88,14 @@ def render_view(
     return Rendering(np.clip(np.rint(mean), 0, 255).astype(np.uint8), depth)
 
 
-def frame_in_camera(quad: Quad, view: PinholeView) -> np.ndarray:
-    """(3, 3) float64: (u, v, 1) of a quad's plane -> the point in the camera's frame."""
+def frame_in_camera(quad: Plane, view: PinholeView) -> np.ndarray:
+    """(3, 3) float64: (u, v, 1) of a plane -> the point in the camera's frame."""
     rotation, translation = view.cam_from_world[:, :3], view.cam_from_world[:, 3]
     return np.column_stack([rotation @ quad.edge_u, rotation @ quad.edge_v, rotation @ quad.origin + translation])
 
 
-def uvw_from_px(quad: Quad, view: PinholeView) -> np.ndarray | None:
-    """(3, 3): px (x, y, 1) -> (u, v, 1) / z-depth of the quad's plane, all affine in x and y. None if edge-on."""
+def uvw_from_px(quad: Plane, view: PinholeView) -> np.ndarray | None:
+    """(3, 3): px (x, y, 1) -> (u, v, 1) / z-depth of the plane, all affine in x and y. None if edge-on."""
     frame = frame_in_camera(quad, view)
     if abs(np.linalg.det(frame)) < 1e-12:
         return None
@@ -128,6 +142,7 @@ def _find_nearest(quads: tuple[Quad, ...], view: PinholeView, samples: int) -> t
 def _colour_samples(quad: Quad, view: PinholeView, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Lit colours (N, 3) float32 of a quad at samples of the SAMPLES-fold grid that see it."""
     m = uvw_from_px(quad, view)
+    assert m is not None  # no sample sees a plane edge-on
     x, y = (columns + 0.5) / SAMPLES, (rows + 0.5) / SAMPLES
     u, v, w = (a * x + b * y + c for a, b, c in m)
     u, v = u / w, v / w

@@ -44,7 +44,7 @@ def _make_masonry(
 ) -> np.ndarray:
     """Courses of stones, bricks or planks (vertical: upright), no two alike: (H, W, 3) float32."""
     if vertical:
-        args = (size_hw[::-1], stone_wh, joint_px, colours, joint_colour, bend_px)
+        args = ((size_hw[1], size_hw[0]), stone_wh, joint_px, colours, joint_colour, bend_px)
         return np.ascontiguousarray(_make_masonry(rng, *args).transpose(1, 0, 2))
     height, width = size_hw
     stone_w, stone_h = stone_wh

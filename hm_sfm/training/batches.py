@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 from hm_sfm.errors import HmSfmError
 from hm_sfm.training.config import TrainConfig
@@ -16,6 +16,7 @@ from hm_sfm.training.multiview import VALIDATION_SCENES, PhotoPairs, read_photo_
 from hm_sfm.training.photos import WarpedPhotos
 from hm_sfm.training.processes import Processes
 from hm_sfm.training.scenes import RenderedScenes
+from hm_sfm.types import TrainingPairs
 
 MOST_WORKERS = 8
 """Processes that prepare the batches of one training process."""
@@ -25,7 +26,7 @@ def make_pairs(photos: list[np.ndarray], config: TrainConfig, seed: int, count: 
     """`count` pairs of all kinds, in the configured mixture; held_out: of the scenes that validate."""
     size_wh = (config.size_px, config.size_px)
     rest = 1 - config.rendered_share - config.real_share - config.megadepth_share
-    kinds: list[tuple[Dataset, float]] = [
+    kinds: list[tuple[TrainingPairs, float]] = [
         # A remainder due to rounding is no share.
         (WarpedPhotos(photos, size_wh, seed, count, config.warp), rest if rest > 1e-9 else 0.0),
         (RenderedScenes(photos, size_wh, seed, count, config.views), config.rendered_share),
@@ -44,12 +45,12 @@ def make_pairs(photos: list[np.ndarray], config: TrainConfig, seed: int, count: 
 
 
 def iterate_batches(
-    pairs: Dataset, pairs_per_step: int, first_step: int, processes: Processes
+    pairs: MixedPairs, pairs_per_step: int, first_step: int, processes: Processes
 ) -> Iterator[dict[str, Tensor]]:
     """The share of each step's pairs that this process takes, from `first_step` on, prepared by worker processes."""
     share = pairs_per_step // processes.count
     first_pair = first_step * pairs_per_step + processes.rank * share
-    batches = [range(pair, pair + share) for pair in range(first_pair, len(pairs), pairs_per_step)]
+    batches = [list(range(pair, pair + share)) for pair in range(first_pair, len(pairs), pairs_per_step)]
     workers = min(max((os.cpu_count() or 1) // (2 * processes.count), 1), MOST_WORKERS)
     loader = DataLoader(
         pairs,

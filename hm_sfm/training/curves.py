@@ -63,4 +63,5 @@ def smooth(step: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """Running means of both (N,) over SMOOTHED_SHARE of them, (M,) each; M > 0 where N is."""
     width = max(1, round(SMOOTHED_SHARE * len(value)))
     kernel = np.full(width, 1 / width)
-    return tuple(np.convolve(x, kernel, mode="valid") if len(x) else x for x in (step, value))
+    mean_step, mean_value = (np.convolve(x, kernel, mode="valid") if len(x) else x for x in (step, value))
+    return mean_step, mean_value

@@ -186,7 +186,8 @@ def paint_facet(image: np.ndarray, seen_facet: SeenFacet, share: np.ndarray) -> 
         left, top, width, height = cv2.boundingRect(members.view(np.uint8))
         if width:
             inner = slice(top, top + height), slice(left, left + width)
-            there = tuple(slice(i.start + p.start, i.stop + p.start) for i, p in zip(inner, part))
+            rows, columns = (slice(i.start + p.start, i.stop + p.start) for i, p in zip(inner, part))
+            there = rows, columns
             _add_texture(image, seen_facet.facet.texture, texel_from_px, share[there] * members[inner], there)
 
 

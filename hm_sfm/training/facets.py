@@ -100,7 +100,7 @@ def make_box(
             edge_u, edge_v = edge_v, edge_u
         origin = centre + sign * rotation[:, axis] * size[axis] / 2 - edge_u / 2 - edge_v / 2
         photo = photos[len(faces)]
-        copies = count_copies(np.linalg.norm(edge_u), centre[2], photo.shape[1], focal_px)
+        copies = count_copies(float(np.linalg.norm(edge_u)), centre[2], photo.shape[1], focal_px)
         texel_from_uv = np.diag([copies * photo.shape[1], copies * photo.shape[0], 1.0])
         faces.append(Facet(origin, edge_u, edge_v, Texture(photo, copies), texel_from_uv))
     return faces

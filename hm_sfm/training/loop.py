@@ -157,7 +157,7 @@ def average_gradients(parameters: list[nn.Parameter], processes: Processes) -> N
     for parameter in parameters:
         if parameter.grad is None:
             parameter.grad = torch.zeros_like(parameter)
-    processes.average([parameter.grad for parameter in parameters])
+    processes.average([parameter.grad for parameter in parameters if parameter.grad is not None])
 
 
 def learning_rate_at(step: int, config: TrainConfig) -> float:

@@ -112,9 +112,9 @@ class MegaDepthPairs(Dataset):
         view_a, view_b = (read_view(self.root, scene, photo, self.size_wh) for photo in pair)
         b_from_a, surface = relate_depths(view_a, view_b, self.size_wh)
         images = np.zeros((2, *surface.shape), np.uint8)
-        for image, view in zip(images, (view_a, view_b)):
+        for index_in_pair, view in enumerate((view_a, view_b)):
             height, width = view.grey.shape
-            image[:height, :width] = disturb_view(view.grey, rng)
+            images[index_in_pair, :height, :width] = disturb_view(view.grey, rng)
         return {
             "images": images,
             "b_from_a": b_from_a,
@@ -323,6 +323,7 @@ def fit_planes(x: np.ndarray, y: np.ndarray, inverse_depth: np.ndarray) -> np.nd
     design = np.stack([(x - centre_x) / BLOCK_PX, (y - centre_y) / BLOCK_PX, np.ones(x.shape)], axis=2)
     target = (inverse_depth / scale)[..., None]
     weight = known[..., None].astype(np.float64)
+    solution = np.zeros((len(x), 3, 1))
     for _ in range(FIT_ROUNDS):
         weighted = (design * weight).swapaxes(1, 2)
         # The ridge makes windows without a depth solvable; it weighs nothing beside the samples of the others.

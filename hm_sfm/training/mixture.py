@@ -6,11 +6,13 @@ import numpy as np
 from torch import Tensor
 from torch.utils.data import Dataset, default_collate
 
+from hm_sfm.types import TrainingPairs
+
 
 class MixedPairs(Dataset):
     """Items of several data sets of the same length, drawn by their shares; deterministic per seed and index."""
 
-    def __init__(self, kinds: Sequence[tuple[Dataset, float]], seed: int) -> None:
+    def __init__(self, kinds: Sequence[tuple[TrainingPairs, float]], seed: int) -> None:
         self.kinds = [pairs for pairs, share in kinds if share > 0]
         self.shares = np.array([share for _, share in kinds if share > 0])
         self.seed = seed

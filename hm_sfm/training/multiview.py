@@ -17,6 +17,7 @@ from torch.utils.data import Dataset
 
 from hm_sfm.errors import InputError
 from hm_sfm.geometry.frames import homography_to_pixel_index
+from hm_sfm.io.arrays import read_array
 from hm_sfm.io.atomic import replace_file
 from hm_sfm.training.photos import POINTS, SURFACES, disturb_view, render_view
 
@@ -97,16 +98,15 @@ def read_photo_pairs(tracks: Path, photos: Path, names: Sequence[str] | None = N
 
 
 def _read_scene(path: Path, folder: Path) -> list[PhotoPair]:
-    seen = {}
+    seen: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+
+    def read(name: str, node: object) -> None:
+        if isinstance(node, h5py.Group) and "point" in node:
+            seen[name] = read_array(node, "point"), read_array(node, "xy")
+
     try:
         with h5py.File(path) as file:
-            file.visititems(
-                lambda name, group: (
-                    seen.update({name: (group["point"][:], group["xy"][:])})
-                    if isinstance(group, h5py.Group) and "point" in group
-                    else None
-                )
-            )
+            file.visititems(read)
     except (OSError, KeyError) as error:
         raise InputError(f"{path} is damaged or no file of tracks: {error}") from error
     for name in seen:

@@ -1,5 +1,8 @@
 """What a batch of training pairs says about the network: the losses of its stages, and scores on held-out pairs."""
 
+# What measure_objective makes for a stage it uses for the same stage only.
+# pyright: reportPossiblyUnboundVariable=false
+
 import dataclasses
 from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
@@ -8,8 +11,8 @@ import torch
 from torch import Tensor
 
 from hm_sfm.network.aspan import Flow
-from hm_sfm.network.backbone import FeatureMaps
-from hm_sfm.network.coarse import AspanCoarse
+from hm_sfm.network.backbone import FeatureMaps, require_fine
+from hm_sfm.network.coarse import AspanCoarse, CosineCoarse
 from hm_sfm.network.fine import FineEstimate, make_fine_map
 from hm_sfm.network.homonet import HomoNet
 from hm_sfm.training.losses import (
@@ -59,7 +62,7 @@ def run_coarse(net: HomoNet, maps: FeatureMaps) -> tuple[Tensor, Tensor, list[tu
 
 def run_fine(net: HomoNet, maps: FeatureMaps, supervision: PatchSupervision | PointSupervision) -> list[FineEstimate]:
     """The head's estimates of the supervised patches."""
-    fine = maps.fine.unflatten(0, (-1, 2))
+    fine = require_fine(maps).unflatten(0, (-1, 2))
     fine0, fine1 = make_fine_map(fine[:, 0]), make_fine_map(fine[:, 1])
     return net.head(fine0, fine1, supervision.image_index, supervision.cell0, supervision.cell1)
 
@@ -91,6 +94,7 @@ def measure_objective(
             estimates = run_fine(net, maps, patches)
             point_estimates = run_fine(net, maps, points) if len(points.image_index) else []
     if stage != "fine":
+        assert not isinstance(net.coarse, CosineCoarse)  # which has nothing to train
         parts["coarse"] = measure_coarse_loss(coarse0, coarse1, net.coarse.sharpness, supervision)
         parts["loss"] = parts["loss"] + parts["coarse"]
         if flows:

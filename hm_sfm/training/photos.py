@@ -183,5 +183,7 @@ def disturb_view(view: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     view = np.clip(x * 255 + 0.5, 0, 255).astype(np.uint8)
     if rng.random() < 0.4:
         _, code = cv2.imencode(".jpg", view, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(40, 95))])
-        view = cv2.imdecode(code, cv2.IMREAD_GRAYSCALE)
+        decoded = cv2.imdecode(code, cv2.IMREAD_GRAYSCALE)
+        assert decoded is not None
+        return decoded
     return view

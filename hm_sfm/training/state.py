@@ -9,7 +9,7 @@ from torch import nn
 
 from hm_sfm.errors import ConfigError, WeightsError
 from hm_sfm.io.atomic import replace_file
-from hm_sfm.network.backbone import load_xfeat
+from hm_sfm.network.backbone import LightBackbone, load_xfeat
 from hm_sfm.network.checkpoints import fit_state, load_loftr, load_parts, read_checkpoint
 from hm_sfm.network.homonet import HomoNet
 from hm_sfm.training.config import TrainConfig, run_fingerprint
@@ -58,7 +58,7 @@ def start_network(net: HomoNet, path: Path) -> None:
         new = load_parts(net, content, path)
         if new:
             logger.warning("%s has no fitting weights for %s: they start new", path, ", ".join(new))
-    elif net.config.backbone == "light":
+    elif isinstance(net.backbone, LightBackbone):
         load_xfeat(net.backbone.trunk, path)
     else:
         load_loftr(net, path)

@@ -4,7 +4,6 @@ It is a definition, not a folder of files: every 15th photo of the training fold
 """
 
 import numpy as np
-from torch.utils.data import Dataset
 
 from hm_sfm.errors import InputError
 from hm_sfm.training.photos import WarpedPhotos, WarpRange, split_photos
@@ -15,7 +14,7 @@ VALIDATION_SEED = 411_06700
 KINDS = ("rendered", "warped")
 
 
-def make_validation_pairs(photos: list[np.ndarray], kind: str, count: int) -> Dataset:
+def make_validation_pairs(photos: list[np.ndarray], kind: str, count: int) -> WarpedPhotos | RenderedScenes:
     """`count` pairs of a kind, rendered or warped; fewer are the first of more.
 
     photos: all of the training folder, as load_photos reads them; the held-out ones are taken here. Items as

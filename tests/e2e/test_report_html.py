@@ -112,7 +112,7 @@ def large_report() -> Report:
         )
         for i in range(100)
     )  # fmt: skip
-    links = {(i, j): int(rng.integers(30, 3000)) for i in range(100) for j in range(i + 1, 100)}
+    verified = {(i, j): int(rng.integers(30, 3000)) for i in range(100) for j in range(i + 1, 100)}
     _, code = cv2.imencode(".jpg", rng.integers(0, 255, (420, 1128, 3), np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 75])
     weak = WeakPair(ImagePair("a", "b"), 30, code.tobytes())
     seconds = {"features": 20.0, "match": 900.0, "keypoints": 60.0, "verify": 90.0, "map": 200.0, "total": 1280.0}
@@ -128,7 +128,7 @@ def large_report() -> Report:
         summary=summary,
         images=images,
         num_pairs=4950,
-        links=links,
+        verified_pairs=verified,
         scene=Scene(xyz, rng.integers(0, 255, (100_000, 3)), frusta, tuple(image.name for image in images)),
         track_lengths={"this run": {n: 1000 // n for n in range(2, 60)}},
         weak_pairs=(weak,) * 8,

@@ -384,9 +384,9 @@ def test_known_poses_are_kept_and_points_triangulated(tmp_path):
         np.testing.assert_allclose(image.cam_from_world().matrix(), expected, atol=1e-12)
     np.testing.assert_array_equal(stored.cameras[1].params, cameras.cameras[0].params)
     assert stored.num_points3D() >= 140
-    truth = np.array([point.xyz for point in oracle.model.points3D.values()])
-    found = np.array([point.xyz for point in stored.points3D.values()])
-    distance = np.linalg.norm(found[:, None] - truth[None], axis=2).min(axis=1)
+    true_points = np.array([point.xyz for point in oracle.model.points3D.values()])
+    points = np.array([point.xyz for point in stored.points3D.values()])
+    distance = np.linalg.norm(points[:, None] - true_points[None], axis=2).min(axis=1)
     assert np.quantile(distance, 0.9) < 1e-3
 
 
@@ -535,8 +535,8 @@ def test_many_pairs_keep_those_that_agree_with_spread_inliers_as_the_strongest()
     chosen = np.flatnonzero((corner.xy0[:, 0] > 700) & (corner.xy0[:, 1] > 500))[: right.sum()]
     images = [ImageRef(name, Path(name), SIZE_WH) for name in ("a.jpg", "b.jpg", "c.jpg")]
     stored = {
-        found.pair: found
-        for found in (
+        matches.pair: matches
+        for matches in (
             spread,
             make_matches(corner.xy0[chosen], corner.xy1[chosen], "a.jpg", "c.jpg"),
             make_matches(spread.xy0, spread.xy1[::-1], "b.jpg", "c.jpg"),
@@ -562,7 +562,7 @@ def test_no_pairs_verify_to_nothing():
 
 
 def test_oracle_matches_through_hlocs_files_give_the_oracles_model(tmp_path, oracle):
-    pairs = [found.pair for found in oracle.matches]
+    pairs = [matches.pair for matches in oracle.matches]
     px_scales = {image.name: 1.0 for image in oracle.images}
     write_features(tmp_path / "features.h5", oracle.images, oracle.keypoints, px_scales)
     write_matches(tmp_path / "matches.h5", pairs, oracle.keypoints, oracle.matches)

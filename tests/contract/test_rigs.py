@@ -106,10 +106,10 @@ def assert_is_the_rig(rigs: list[pycolmap.Rig], oracle: Oracle, scale_is_known: 
     (pose,) = rig.non_ref_sensors.values()
     assert rig.num_sensors() == 2
     assert np.degrees(pose.rotation.angle_to(oracle.right_from_left.rotation)) < 0.05
-    found, expected = pose.translation, oracle.right_from_left.translation
+    actual, expected = pose.translation, oracle.right_from_left.translation
     if not scale_is_known:
-        found, expected = found / np.linalg.norm(found), expected / np.linalg.norm(expected)
-    np.testing.assert_allclose(found, expected, atol=0.005)
+        actual, expected = actual / np.linalg.norm(actual), expected / np.linalg.norm(expected)
+    np.testing.assert_allclose(actual, expected, atol=0.005)
 
 
 @pytest.mark.parametrize("mapper", ["incremental", "global"])

@@ -54,11 +54,11 @@ def test_a_cluster_that_loses_a_worker_matches_as_one_process_does(
     finished = run("match", tiny_photos, tmp_path / "out", "--engine", "ray")
     assert finished.code == 0, finished.err
     assert mortal.exists() and len(matched_pairs) == 15
-    found, expected = (read_matches(tmp_path / name / "matches.h5") for name in ("out", "serial"))
-    assert found.keys() == expected.keys()
+    actual, expected = (read_matches(tmp_path / name / "matches.h5") for name in ("out", "serial"))
+    assert actual.keys() == expected.keys()
     assert sum(len(fields["score"]) for fields in expected.values()) > 100
     for pair, fields in expected.items():
-        assert all(found[pair][field].tobytes() == data.tobytes() for field, data in fields.items()), pair
+        assert all(actual[pair][field].tobytes() == data.tobytes() for field, data in fields.items()), pair
 
     # The engine is no part of the settings that matches are made with.
     assert run("match", tiny_photos, tmp_path / "serial", "--engine", "ray").code == 0

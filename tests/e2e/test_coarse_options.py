@@ -20,8 +20,8 @@ def test_a_run_starts_from_sift(scene, tmp_path, run):
     finished = run(*command, "--coarse", "sift", "--quiet")
     assert (finished.code, finished.err) == (0, "")
     with h5py.File(tmp_path / "out" / "matches.h5") as h5:
-        found = h5["000000"]
-        xy0, xy1, score = (found[name][()] for name in ("xy0", "xy1", "score"))
+        group = h5["000000"]
+        xy0, xy1, score = (group[name][()] for name in ("xy0", "xy1", "score"))
         assert (score > 0.5).sum() > 50
         assert ((xy0 * 2) % 1).any()  # no centres of cells
     assert_refused(run(*command), "matches.h5 was made with matching.coarse 'sift (pycolmap")

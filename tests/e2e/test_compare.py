@@ -58,20 +58,20 @@ def compared(scene, reconstructed, options, tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def figures(compared) -> dict:
+def metrics(compared) -> dict:
     return json.loads((compared / "compare.json").read_text())
 
 
 # Comparing
 
 
-def test_every_method_is_in_the_json(figures):
-    assert figures.keys() == {
+def test_every_method_is_in_the_json(metrics):
+    assert metrics.keys() == {
         "num_images", "skipped_images", "num_pairs", "methods", "config_fingerprint", "version",
     }  # fmt: skip
-    assert (figures["num_images"], figures["skipped_images"], figures["num_pairs"]) == (5, 0, 10)
-    assert tuple(figures["methods"]) == (*METHODS, "hloc")
-    for method in figures["methods"].values():
+    assert (metrics["num_images"], metrics["skipped_images"], metrics["num_pairs"]) == (5, 0, 10)
+    assert tuple(metrics["methods"]) == (*METHODS, "hloc")
+    for method in metrics["methods"].values():
         assert method["seconds"].keys() == {"match", "keypoints", "verify", "map"}
         assert method["auc_percent"].keys() == {"0.25", "0.5", "1", "3"}
         histogram = {int(length): count for length, count in method["track_length_histogram"].items()}
@@ -82,8 +82,8 @@ def test_every_method_is_in_the_json(figures):
         assert sum(count for n, count in histogram.items() if n >= 3) == method["points_in_3_images"]
 
 
-def test_models_stand_side_by_side(compared, figures):
-    for name, method in figures["methods"].items():
+def test_models_stand_side_by_side(compared, metrics):
+    for name, method in metrics["methods"].items():
         assert (compared / name / "database.db").exists()
         assert (compared / name / "sparse").exists() == (method["models"] > 0)
         if method["models"]:
@@ -91,9 +91,9 @@ def test_models_stand_side_by_side(compared, figures):
             assert model.num_reg_images() == method["registered"] and model.num_points3D() == method["points"]
 
 
-def test_persistent_is_what_reconstruct_makes(compared, figures):
+def test_persistent_is_what_reconstruct_makes(compared, metrics):
     summary = json.loads((compared / "persistent" / "summary.json").read_text())
-    method = figures["methods"]["persistent"]
+    method = metrics["methods"]["persistent"]
     assert method["registered"] == summary["registered"] == 5
     assert method["points"] == summary["points"]
     assert method["mean_track_length"] == pytest.approx(summary["mean_track_length"], abs=1e-4)
@@ -101,23 +101,23 @@ def test_persistent_is_what_reconstruct_makes(compared, figures):
     assert method["auc_percent"]["3"] > 80
 
 
-def test_loftr_style_matches_give_models_with_shorter_tracks(figures):
-    methods = figures["methods"]
+def test_loftr_style_matches_give_models_with_shorter_tracks(metrics):
+    methods = metrics["methods"]
     for style in STYLES:
         assert methods[f"loftr_style_{style}"]["registered"] >= 2
-    for figure in ("mean_track_length", "mean_matched_track_length"):
-        assert methods["loftr_style_raw"][figure] < methods["persistent"][figure]
+    for name in ("mean_track_length", "mean_matched_track_length"):
+        assert methods["loftr_style_raw"][name] < methods["persistent"][name]
 
 
-def test_keypoints_through_hlocs_files_map_as_well(figures):
-    ours, theirs = figures["methods"]["persistent"], figures["methods"]["hloc"]
+def test_keypoints_through_hlocs_files_map_as_well(metrics):
+    ours, theirs = metrics["methods"]["persistent"], metrics["methods"]["hloc"]
     assert theirs["registered"] == 5
     assert theirs["points"] == pytest.approx(ours["points"], rel=0.02)
     assert theirs["mean_track_length"] == pytest.approx(ours["mean_track_length"], rel=0.02)
     assert theirs["seconds"]["match"] is None and theirs["seconds"]["map"] > 0
 
 
-def test_a_second_run_keeps_everything(scene, compared, options, figures, run, digest_files, matched_pairs):
+def test_a_second_run_keeps_everything(scene, compared, options, metrics, run, digest_files, matched_pairs):
     before = digest_files(compared)
     finished = run("compare", scene.images, compared, *options)
     assert finished.code == 0, finished.err
@@ -128,7 +128,7 @@ def test_a_second_run_keeps_everything(scene, compared, options, figures, run, d
     assert {name: after[name] for name in after.keys() - rewritten} == {
         name: before[name] for name in before.keys() - rewritten
     }
-    assert json.loads((compared / "compare.json").read_text()) == figures
+    assert json.loads((compared / "compare.json").read_text()) == metrics
 
     heading, *rows = finished.out.splitlines()
     assert heading.startswith("method ") and "AUC@0.25" in heading

@@ -59,10 +59,10 @@ def undisturbed(start_matching, tmp_path_factory) -> tuple[Path, float]:
     return out / "second" / "matches.h5", seconds
 
 
-def assert_same_matches(found: dict, expected: dict) -> None:
-    assert found.keys() == expected.keys()
+def assert_same_matches(actual: dict, expected: dict) -> None:
+    assert actual.keys() == expected.keys()
     for pair, fields in expected.items():
-        assert {field: data.tobytes() for field, data in found[pair].items()} == {
+        assert {field: data.tobytes() for field, data in actual[pair].items()} == {
             field: data.tobytes() for field, data in fields.items()
         }, pair
 

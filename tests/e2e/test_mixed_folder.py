@@ -77,7 +77,7 @@ def is_hidden(name: str, xy: np.ndarray, mixed: Mixed) -> np.ndarray:
     return hidden[row, column]
 
 
-def carry_by_truth(xy: np.ndarray, name: str, other: str, mixed: Mixed) -> np.ndarray:
+def transfer_truly(xy: np.ndarray, name: str, other: str, mixed: Mixed) -> np.ndarray:
     """Where points of one stored photo are in another one, (N, 2) px, by the depth of their pixels; the sky is far."""
     view, (column, row) = mixed.views[name], np.floor(xy).astype(int).T
     rays = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(view.K).T
@@ -113,16 +113,16 @@ def test_a_mixed_folder_becomes_one_model_in_stored_pixels(mixed, tmp_path, run,
     errors = []
     for pair, matches in read_verified_matches(out / "database.db").items():
         xy0, xy1 = xy_of[pair.name0][matches[:, 0]], xy_of[pair.name1][matches[:, 1]]
-        errors.append(np.linalg.norm(carry_by_truth(xy0, pair.name0, pair.name1, mixed) - xy1, axis=1))
+        errors.append(np.linalg.norm(transfer_truly(xy0, pair.name0, pair.name1, mixed) - xy1, axis=1))
     assert len(errors) > 8
     errors_px = np.concatenate(errors)
     assert np.median(errors_px) < 0.5
     assert np.quantile(errors_px, 0.8) < 1.5
 
-    # Nothing masked is matched, though the network found matches there.
+    # Nothing masked is matched, though the network sees matches there.
     stored = read_matches(out / "matches.h5")
     for name in HIDDEN:
-        found = [data[f"xy{names.index(name)}"] for names, data in stored.items() if name in names]
-        assert is_hidden(name, np.concatenate(found), mixed).sum() > 50
+        xy = [data[f"xy{names.index(name)}"] for names, data in stored.items() if name in names]
+        assert is_hidden(name, np.concatenate(xy), mixed).sum() > 50
         assert not is_hidden(name, xy_of[name], mixed).any()
         assert len(xy_of[name]) > 100

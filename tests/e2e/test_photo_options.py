@@ -61,13 +61,13 @@ def test_known_poses_are_triangulated(scene, reconstructed, out, run):
     finished = run("reconstruct", scene.images, out, "--poses", model, "--quiet")
     assert finished.code == 0, finished.err
     assert finished.out.startswith("5 of 5 images registered")
-    given, found = pycolmap.Reconstruction(model), pycolmap.Reconstruction(out / "sparse" / "0")
+    given, rebuilt = pycolmap.Reconstruction(model), pycolmap.Reconstruction(out / "sparse" / "0")
     for image in given.images.values():
-        pose = found.find_image_with_name(image.name).cam_from_world().matrix()
+        pose = rebuilt.find_image_with_name(image.name).cam_from_world().matrix()
         np.testing.assert_allclose(pose, image.cam_from_world().matrix(), atol=1e-12)
-    np.testing.assert_array_equal(found.cameras[1].params, given.cameras[1].params)
-    assert found.num_points3D() > 0.8 * given.num_points3D()
-    assert found.compute_mean_reprojection_error() < 1.5
+    np.testing.assert_array_equal(rebuilt.cameras[1].params, given.cameras[1].params)
+    assert rebuilt.num_points3D() > 0.8 * given.num_points3D()
+    assert rebuilt.compute_mean_reprojection_error() < 1.5
 
 
 def test_known_cameras_are_kept(scene, reconstructed, out, run, tmp_path):
@@ -77,9 +77,9 @@ def test_known_cameras_are_kept(scene, reconstructed, out, run, tmp_path):
     model.write_text(tmp_path / "known")
     finished = run("reconstruct", scene.images, out, "--cameras", tmp_path / "known" / "cameras.txt", "--quiet")
     assert finished.code == 0, finished.err
-    found = pycolmap.Reconstruction(out / "sparse" / "0")
-    assert found.num_reg_images() == 5
-    np.testing.assert_allclose(found.cameras[1].params, model.cameras[1].params, rtol=1e-12)
+    rebuilt = pycolmap.Reconstruction(out / "sparse" / "0")
+    assert rebuilt.num_reg_images() == 5
+    np.testing.assert_allclose(rebuilt.cameras[1].params, model.cameras[1].params, rtol=1e-12)
 
 
 def test_cameras_that_name_other_images(scene, reconstructed, tmp_path, run, digest_files):

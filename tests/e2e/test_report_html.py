@@ -186,13 +186,13 @@ def test_a_report_of_100_images_is_small_and_can_be_turned_and_sorted(large_repo
     seen = visit(page)
     assert seen.console == []
     assert seen.point_pixels > 50_000
-    found = json.loads(html.unescape(re.search(r'data-visit="(.*?)"', seen.dom).group(1)))
-    assert found["changed"] == {
+    visit = json.loads(html.unescape(re.search(r'data-visit="(.*?)"', seen.dom).group(1)))
+    assert visit["changed"] == {
         "nothing": False, "turn": True, "move": True, "zoom": True, "pinch": True, "key": True, "cameras": True,
         "reset": False,
     }  # fmt: skip
     name = "folder {}/<IMG>_{}.jpg".format
-    assert found["rows"] == [name(0, 0), name(0, 99), name(0, 0), name(0, 0)]
+    assert visit["rows"] == [name(0, 0), name(0, 99), name(0, 0), name(0, 0)]
 
 
 def test_without_a_model_the_page_has_no_errors(large_report, tmp_path, visit):

@@ -198,5 +198,5 @@ def test_a_cache_too_small_for_a_pair(limit_mb, scene, tmp_path, run):
 def test_a_cache_of_one_pair_changes_no_match(tiny_photos, serial, tmp_path, run, read_groups):
     finished = run("match", tiny_photos, tmp_path / "out", "--set", "matching.feature_cache_mb=1")
     assert finished.code == 0, finished.err
-    found, expected = read_groups(tmp_path / "out" / "matches.h5"), read_groups(serial)
-    assert found == expected and np.all([len(attrs) == 5 for attrs, _ in found.values()])
+    merged, expected = read_groups(tmp_path / "out" / "matches.h5"), read_groups(serial)
+    assert merged == expected and np.all([len(attrs) == 5 for attrs, _ in merged.values()])

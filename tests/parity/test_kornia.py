@@ -35,8 +35,8 @@ def matcher(checkpoint) -> LoftrMatcher:
 def test_the_network_is_that_of_the_checkpoint(matcher, net):
     image = torch.rand(1, 1, 32, 40, generator=torch.Generator().manual_seed(1))
     with torch.inference_mode():
-        for found, expected in zip(matcher.net.backbone(image), net.backbone(image)):
-            assert torch.equal(found, expected)
+        for actual, expected in zip(matcher.net.backbone(image), net.backbone(image)):
+            assert torch.equal(actual, expected)
 
 
 def test_points_are_px_of_the_stored_photos_best_first(matcher, monkeypatch):
@@ -44,12 +44,12 @@ def test_points_are_px_of_the_stored_photos_best_first(matcher, monkeypatch):
     features = matcher.encode(prepare_array(np.full((120, 200), 128, np.uint8), 100))
     assert features.pixels.shape == (1, 1, 64, 104) and features.size_bytes == 64 * 104 * 4
     assert features.pixels[0, 0, 59, 99] == pytest.approx(128 / 255) and features.pixels[0, 0, 60, 100] == 0
-    found = {
+    output = {
         "keypoints0": torch.tensor([(8.0, 16), (16, 16), (24, 16), (32, 16), (40, 16), (99, 16)]),
         "keypoints1": torch.tensor([(9.5, 16), (18, 17), (101, 16), (32, 15), (40, 59), (99, 61)]),
         "confidence": torch.tensor([0.5, 0.9, 1.0, 0.7, 0.3, 1.0]),
     }
-    monkeypatch.setattr(matcher.net, "forward", lambda data: found)
+    monkeypatch.setattr(matcher.net, "forward", lambda data: output)
     matches = matcher.match_features(features, features)
     np.testing.assert_array_equal(matches.xy0, [(32, 32), (64, 32), (16, 32)])
     np.testing.assert_array_equal(matches.xy1, [(36, 34), (64, 30), (19, 32)])

@@ -123,8 +123,8 @@ def test_colmap_gets_files_that_it_can_read(tmp_path):
     write_photo(tmp_path / "a.jpg", textured(64, 48))
     images = list_images(tmp_path).images
     with open_to_colmap(images, tmp_path) as folder:
-        found = [pycolmap.Bitmap.read(folder / image.name, as_rgb=True).to_array().astype(int) for image in images]
-    assert np.abs(found[0] - found[1]).mean() < 4
+        read = [pycolmap.Bitmap.read(folder / image.name, as_rgb=True).to_array().astype(int) for image in images]
+    assert np.abs(read[0] - read[1]).mean() < 4
     assert not folder.exists() and folder != tmp_path
     with open_to_colmap(images[:1], tmp_path) as folder:
         assert folder == tmp_path  # nothing to do

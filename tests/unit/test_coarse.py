@@ -47,12 +47,12 @@ def test_it_starts_as_the_plain_features(maps):
     cells = as_cells(coarse.describe(maps))
     corrected0, corrected1 = coarse(cells[:1], cells[1:])
     assert torch.equal(corrected0, plain[:1]) and torch.equal(corrected1, plain[1:])
-    found = coarse.match(cells[0], cells[1], 0.2)
+    matches = coarse.match(cells[0], cells[1], 0.2)
     expected = match_by_dual_softmax(plain[0], plain[1], 0.2, torch.tensor(35.0))
-    assert len(found[0]) > 40
-    assert torch.equal(found[0], expected[0]) and torch.equal(found[1], expected[1])
-    torch.testing.assert_close(found[2], expected[2])
-    assert 0 < len(coarse.match(cells[0], cells[1], 0.9)[0]) < len(found[0])
+    assert len(matches[0]) > 40
+    assert torch.equal(matches[0], expected[0]) and torch.equal(matches[1], expected[1])
+    torch.testing.assert_close(matches[2], expected[2])
+    assert 0 < len(coarse.match(cells[0], cells[1], 0.9)[0]) < len(matches[0])
 
 
 def test_an_image_is_described_up_to_the_first_self_attention(maps, trained):
@@ -64,12 +64,12 @@ def test_an_image_is_described_up_to_the_first_self_attention(maps, trained):
     torch.testing.assert_close(as_cells(described[:, 64:]), first(entered, entered))
     # The rest, per pair, is what the whole transformer makes of the two images.
     cells = as_cells(described)
-    found = trained(cells[:1], cells[1:])
+    corrected = trained(cells[:1], cells[1:])
     aware = trained.transformer(entered[:1], entered[1:])
     for number in range(2):
         expected = as_cells(described[:, :64])[number : number + 1] + trained.leave(aware[number])
-        torch.testing.assert_close(found[number], expected)
-        assert (found[number] - cells[number, :, :64]).abs().mean() > 0.01
+        torch.testing.assert_close(corrected[number], expected)
+        assert (corrected[number] - cells[number, :, :64]).abs().mean() > 0.01
 
 
 def test_the_transformer_goes_on_after_the_layers_that_were_done(generator):
@@ -126,14 +126,14 @@ def test_it_learns_which_of_two_equal_windows_is_meant(generator, one_thread):
     half = torch.randn(1, 64, 4, 4, generator=generator)
     view = torch.cat([half, half], dim=3)
     every = torch.arange(32)
-    truth = CoarseSupervision(torch.zeros(32, dtype=torch.int64), every, every)
+    supervision = CoarseSupervision(torch.zeros(32, dtype=torch.int64), every, every)
     torch.manual_seed(0)
     coarse = AttentionCoarse()
     optimizer = torch.optim.Adam(coarse.parameters(), lr=2e-3)
     losses = []
     for _ in range(40):
         cells = as_cells(coarse.describe(view))
-        losses.append(measure_coarse_loss(*coarse(cells, cells), coarse.sharpness, truth))
+        losses.append(measure_coarse_loss(*coarse(cells, cells), coarse.sharpness, supervision))
         optimizer.zero_grad()
         losses[-1].backward()
         optimizer.step()

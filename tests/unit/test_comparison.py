@@ -114,11 +114,11 @@ def test_a_method_without_a_model_is_a_result_of_zeros(task):
         with pycolmap.Database.open(task.out / "empty" / "database.db"):
             return dict(SECONDS)
 
-    found = finish_method(task, Method("empty", None, build))
-    assert (found.registered, found.models, found.points, found.observations) == (0, 0, 0, 0)
-    assert (found.matched_tracks, found.mean_matched_track_length) == (0, 0)
-    assert (found.mean_track_length, found.median_track_length, found.observations_per_image) == (0, 0, 0)
-    assert found.track_length_histogram == {} and found.auc_percent is None
+    result = finish_method(task, Method("empty", None, build))
+    assert (result.registered, result.models, result.points, result.observations) == (0, 0, 0, 0)
+    assert (result.matched_tracks, result.mean_matched_track_length) == (0, 0)
+    assert (result.mean_track_length, result.median_track_length, result.observations_per_image) == (0, 0, 0)
+    assert result.track_length_histogram == {} and result.auc_percent is None
     assert json.loads((task.out / "empty" / "result.json").read_text())["models"] == 0
 
 
@@ -133,14 +133,14 @@ def test_metrics_count_distinct_images(task):
 
     length = np.array([len({e.image_id for e in point.track.elements}) for point in model.points3D.values()])
     finished = {"models": 1, "seconds": SECONDS, "matched_tracks": 30, "mean_matched_track_length": 3.5}
-    found = measure_method(task, "demo", finished)
-    assert found.points == len(length) == sum(found.track_length_histogram.values())
-    assert found.track_length_histogram == {n: int((length == n).sum()) for n in np.unique(length).tolist()}
-    assert found.points_in_3_images == (length >= 3).sum()
-    assert found.mean_track_length == pytest.approx(length.mean())
-    assert found.median_track_length == np.median(length)
-    assert found.observations == length.sum() + 1
-    assert found.observations_per_image == found.observations / 4
+    result = measure_method(task, "demo", finished)
+    assert result.points == len(length) == sum(result.track_length_histogram.values())
+    assert result.track_length_histogram == {n: int((length == n).sum()) for n in np.unique(length).tolist()}
+    assert result.points_in_3_images == (length >= 3).sum()
+    assert result.mean_track_length == pytest.approx(length.mean())
+    assert result.median_track_length == np.median(length)
+    assert result.observations == length.sum() + 1
+    assert result.observations_per_image == result.observations / 4
 
 
 def test_tracks_of_a_model_name_its_keypoints(tmp_path):
@@ -151,8 +151,8 @@ def test_tracks_of_a_model_name_its_keypoints(tmp_path):
     for track, point_id in enumerate(sorted(model.points3D)):
         rows = slice(tracks.offsets[track], tracks.offsets[track + 1])
         images, keypoints = tracks.image_index[rows].tolist(), tracks.keypoint_index[rows].tolist()
-        found = {(image_ids[image], keypoint) for image, keypoint in zip(images, keypoints)}
-        assert found == {(e.image_id, e.point2D_idx) for e in model.points3D[point_id].track.elements}
+        observed = {(image_ids[image], keypoint) for image, keypoint in zip(images, keypoints)}
+        assert observed == {(e.image_id, e.point2D_idx) for e in model.points3D[point_id].track.elements}
     assert len(read_tracks(pycolmap.Reconstruction())) == 0
 
 

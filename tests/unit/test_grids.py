@@ -159,11 +159,11 @@ def image(waves) -> np.ndarray:
     return waves.render(SIZE_WH, np.eye(3))
 
 
-def measure_offset(matcher: HomoMatcher, image0: np.ndarray, image1: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def measure_offset(matcher: HomoMatcher, image0: np.ndarray, image1: np.ndarray, motion: np.ndarray) -> np.ndarray:
     """(2,) px of image 1: the median signed error of the matches of two images."""
     matches = matcher.match(image0, image1)
     assert len(matches) > 300
-    expected = np.c_[matches.xy0, np.ones(len(matches))] @ truth[:2].T
+    expected = np.c_[matches.xy0, np.ones(len(matches))] @ motion[:2].T
     return np.median(matches.xy1 - expected, axis=0)
 
 
@@ -204,10 +204,10 @@ def test_a_fine_grid_half_a_pixel_off_would_be_seen(matcher, waves, image, monke
 def test_a_smaller_image_shows_no_offset_either(matcher, waves, image):
     """An error d of the grid shows as (1 - s) d one way, as (1 - 1 / s) d the other."""
     scale = 0.7
-    truth = np.diag([scale, scale, 1.0])
-    small = waves.render((int(scale * SIZE_WH[0]), int(scale * SIZE_WH[1])), truth)
-    there = measure_offset(matcher, image, small, truth)
-    back = measure_offset(matcher, small, image, np.linalg.inv(truth))
+    motion = np.diag([scale, scale, 1.0])
+    small = waves.render((int(scale * SIZE_WH[0]), int(scale * SIZE_WH[1])), motion)
+    there = measure_offset(matcher, image, small, motion)
+    back = measure_offset(matcher, small, image, np.linalg.inv(motion))
     assert np.abs(there).max() < OFFSET_LIMIT_PX
     assert abs((there - back).mean() / (1 / scale - scale)) < OFFSET_LIMIT_PX
 

@@ -121,11 +121,11 @@ def test_homography_head_learns_a_small_warp(spacing):
     head = HomographyHead(9, 1, 2, 2, spacing)
     displacement = apply_homography(homography, make_corners(head.half)) - make_corners(head.half)
     index = torch.zeros(count, dtype=torch.int64)
-    truth = PatchSupervision(index, cell_a, cell_b, homography, displacement, torch.ones(count, dtype=torch.bool))
+    supervision = PatchSupervision(index, cell_a, cell_b, homography, displacement, torch.ones(count, dtype=torch.bool))
     optimizer = torch.optim.Adam(head.parameters(), lr=3e-3)
     dense = []
     for _ in range(70):
-        parts = measure_loss(head(fine_a, fine_b, index, cell_a, cell_b), truth, head.half)
+        parts = measure_loss(head(fine_a, fine_b, index, cell_a, cell_b), supervision, head.half)
         optimizer.zero_grad()
         parts["loss"].backward()
         optimizer.step()

@@ -39,8 +39,8 @@ def test_agrees_with_opencv(shifts, half):
     displacement = torch.tensor(shifts).view(1, 4, 2) * half / HALF
     corners = make_corners(half)
     expected = cv2.getPerspectiveTransform(corners.numpy(), (corners + displacement[0]).numpy())
-    found = homography_from_corners(displacement, half)[0].numpy()
-    np.testing.assert_allclose(found, expected / expected[2, 2], atol=1e-3 * half)
+    actual = homography_from_corners(displacement, half)[0].numpy()
+    np.testing.assert_allclose(actual, expected / expected[2, 2], atol=1e-3 * half)
 
 
 def test_no_displacement_is_the_identity():

@@ -27,12 +27,12 @@ def make_matches(name0: str, name1: str, rows: list[tuple[float, ...]]) -> PairM
     )
 
 
-def make_collection(names: str, *pairs: PairMatches, cell_px=None, max_keypoints=100, unit=1.0):
+def make_collection(names: str, *pairs: PairMatches, cell_px=None, max_keypoints=100, px_scale=1.0):
     """make_keypoints of images that are named by single letters; keypoints by name, index matches by both names."""
     images = [ImageRef(name, Path(name), (640, 480)) for name in names]
     stored = {matches.pair: matches for matches in pairs}
     keypoints, matches = make_keypoints(
-        images, list(stored), stored.get, dict.fromkeys(names, unit), cell_px, max_keypoints
+        images, list(stored), stored.get, dict.fromkeys(names, px_scale), cell_px, max_keypoints
     )
     assert [points.name for points in keypoints] == list(names)
     assert [each.pair for each in matches] == list(stored)
@@ -166,7 +166,7 @@ def test_pixels_are_those_of_the_matching_resolution():
         make_matches("a", "b", [(33, 32, 50, 50, 0.9)]),
         make_matches("a", "c", [(30.5, 32, 50, 50, 0.7)]),
         cell_px=1,
-        unit=4.0,
+        px_scale=4.0,
     )
     np.testing.assert_array_equal(keypoints["a"].xy, [(32, 32)])
     np.testing.assert_array_equal(keypoints["a"].sigma_px, [4])

@@ -75,8 +75,8 @@ def test_an_interrupted_training_goes_on_as_if_nothing_had_happened(training, tm
             train(again, quiet=True)
     assert len(read_rows(tmp_path / "again" / "log.csv")) == 3
     resumed = train(again, resume=True, quiet=True)
-    expected, found = load_weights(str(whole)).state_dict(), load_weights(str(resumed)).state_dict()
-    assert all(torch.equal(value, found[name]) for name, value in expected.items())
+    expected, actual = load_weights(str(whole)).state_dict(), load_weights(str(resumed)).state_dict()
+    assert all(torch.equal(value, actual[name]) for name, value in expected.items())
     for name in ("log.csv", "validation.csv"):
         assert read_rows(whole.parent / name) == read_rows(resumed.parent / name)
     assert [row["step"] for row in read_rows(resumed.parent / "log.csv")] == list("123456")

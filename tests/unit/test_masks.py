@@ -1,4 +1,4 @@
-"""Masks: which pixels they hide, how they are found, and what does not fit."""
+"""Masks: which pixels they hide, where they are looked for, and what does not fit."""
 
 from pathlib import Path
 
@@ -46,8 +46,8 @@ def test_exactly_the_black_pixels_are_hidden(tmp_path, images, hidden):
     masks = read_masks(images, MaskConfig(folder=str(tmp_path / "masks")))
     grid = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=-1).reshape(-1, 2)
     for inside_pixel in (0.0, 0.5, 0.999):
-        found = grid[masks.hides("a/b.jpg", grid + inside_pixel)]
-        assert found.tolist() == [list(hidden)]
+        masked = grid[masks.hides("a/b.jpg", grid + inside_pixel)]
+        assert masked.tolist() == [list(hidden)]
     assert not masks.hides("a/b.png", grid).any()
     assert masks.hides("a/b.jpg", np.zeros((0, 2))).shape == (0,)
 

@@ -42,13 +42,13 @@ def test_the_points_of_a_query_come_row_by_row():
 @given(queries=points, points=points, radius=radii)
 def test_nearest_equals_brute_force_and_ties_go_to_the_lower_index(queries, points, radius):
     index, distance = find_nearest(queries, points, radius)
-    for query, found, apart in zip(queries, index, distance):
+    for query, nearest, apart in zip(queries, index, distance):
         away = np.linalg.norm(points - query, axis=1)
         if len(points) and away.min() <= radius:
-            assert found == away.argmin()
+            assert nearest == away.argmin()
             assert apart == pytest.approx(away.min())
         else:
-            assert found == -1 and apart == np.inf
+            assert nearest == -1 and apart == np.inf
 
 
 def test_many_points_of_single_precision():
@@ -79,7 +79,7 @@ def test_a_query_beside_the_last_column_does_not_wrap_into_the_next_row():
 @pytest.mark.parametrize("counts", [(0, 0), (0, 3), (3, 0)])
 def test_nothing_has_no_neighbours(counts):
     queries, points = (np.zeros((n, 2)) for n in counts)
-    assert [len(found) for found in find_pairs_within(queries, points, 1.0)] == [0, 0, 0]
+    assert [len(near) for near in find_pairs_within(queries, points, 1.0)] == [0, 0, 0]
     index, distance = find_nearest(queries, points, 1.0)
     assert index.tolist() == [-1] * counts[0] and distance.tolist() == [np.inf] * counts[0]
 

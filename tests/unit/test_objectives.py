@@ -72,9 +72,9 @@ def make_batch(size_px: int = 64) -> dict[str, torch.Tensor]:
 
 
 def test_only_suppressed_supervision_has_matches_that_are_a_cell_off(monkeypatch):
-    truths = []
+    supervisions = []
     run_fine = objectives.run_fine
-    monkeypatch.setattr(objectives, "run_fine", lambda *args: truths.append(args[2]) or run_fine(*args))
+    monkeypatch.setattr(objectives, "run_fine", lambda *args: supervisions.append(args[2]) or run_fine(*args))
     torch.manual_seed(0)
     net = HomoNet(NetworkConfig(coarse="cosine", iterations=1)).eval()
 
@@ -83,12 +83,12 @@ def test_only_suppressed_supervision_has_matches_that_are_a_cell_off(monkeypatch
         return measure_objective(net, make_batch(), "fine", 400, "fp32", torch.device("cpu"), generator, *supervise)
 
     default, suppressed, _, _ = (measure(*name) for name in ((), ("suppressed",), ("dense",), ("centre",)))
-    off = [apply_homography(t.homography, CENTRE)[t.correct].norm(dim=-1).flatten() for t in truths]
+    off = [apply_homography(t.homography, CENTRE)[t.correct].norm(dim=-1).flatten() for t in supervisions]
     assert default == suppressed and torch.equal(off[0], off[1])
     assert 0.1 < (off[1] > 3.9).float().mean() < 0.4
     assert len(off[2]) == len(off[3]) > 150 and max(off[2].max(), off[3].max()) < 1e-4
     # The same patches are drawn, whatever is supervised.
-    assert torch.equal(truths[2].cell0, truths[3].cell0)
+    assert torch.equal(supervisions[2].cell0, supervisions[3].cell0)
 
 
 def test_points_of_real_photos_are_not_shifted_either():

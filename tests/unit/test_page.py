@@ -85,8 +85,8 @@ def parse(page: str) -> Balance:
 
 def test_every_section_shows_its_figures():
     text = parse(render_page(make_report())).text
-    for figure in ("2 / 3", "4,321", "3.46", "0.457 px", "1 / 3", "1.2.3", "0123abcd"):
-        assert figure in text
+    for number in ("2 / 3", "4,321", "3.46", "0.457 px", "1 / 3", "1.2.3", "0123abcd"):
+        assert number in text
     assert "too few good matches" in text and "at most 3, with a.jpg" in text and "--pairs exhaustive" in text
     assert "this run, mean 3.50" in text and "loftr_style_raw, mean 2.50" in text
     assert "a.jpg – b.jpg: 400 matches" in text

@@ -59,7 +59,7 @@ def test_sequences_compare_numbers_as_numbers():
     assert pair_sequentially(names, 2) == pair_sequentially(names[::-1], 2)
 
 
-class Looks:
+class PlantedAppearance:
     """Images on a circle resemble those next to them; counts how often it is asked."""
 
     def __init__(self, order: list[str] | None = None) -> None:
@@ -68,12 +68,12 @@ class Looks:
     def __call__(self, names: list[str], top: int, gap: int) -> np.ndarray:
         self.asked.append((top, gap))
         place = np.argsort([(self.order or names).index(name) for name in names])
-        found = np.full((len(names), top), -1, np.int64)
+        similar = np.full((len(names), top), -1, np.int64)
         steps = [step for k in range(1, len(names) // 2) for step in (k, -k) if k > gap][:top]
         for at, image in enumerate(place):
             for column, step in enumerate(steps):
-                found[image, column] = place[(at + step) % len(names)]
-        return found
+                similar[image, column] = place[(at + step) % len(names)]
+        return similar
 
 
 def on_circle(names: list[str], reach: int) -> set[ImagePair]:
@@ -87,15 +87,15 @@ def in_order(count: int) -> list[str]:
 
 
 def test_auto_is_exhaustive_up_to_the_limit():
-    looks = Looks()
-    assert select_pairs(numbered(60), PairConfig(exhaustive_limit=60), looks) == pair_exhaustively(numbered(60))
-    assert looks.asked == []
+    appearance = PlantedAppearance()
+    assert select_pairs(numbered(60), PairConfig(exhaustive_limit=60), appearance) == pair_exhaustively(numbered(60))
+    assert appearance.asked == []
 
 
 def test_auto_beyond_takes_what_looks_alike_and_the_window_of_a_sequence():
-    looks = Looks()
-    pairs = select_pairs(numbered(200), PairConfig(window=5, retrieval_top=4), looks)
-    assert looks.asked == [(4, 0)] and len(set(pairs)) == len(pairs)
+    appearance = PlantedAppearance()
+    pairs = select_pairs(numbered(200), PairConfig(window=5, retrieval_top=4), appearance)
+    assert appearance.asked == [(4, 0)] and len(set(pairs)) == len(pairs)
     within = {ImagePair.of(f"img{i}.jpg", f"img{j}.jpg") for i in range(200) for j in range(i + 1, min(i + 6, 200))}
     assert set(pairs) == on_circle(in_order(200), 2) | within
 
@@ -103,31 +103,31 @@ def test_auto_beyond_takes_what_looks_alike_and_the_window_of_a_sequence():
 def test_numbers_that_say_nothing_about_the_looks_make_no_sequence():
     shuffled = in_order(200)
     np.random.default_rng(0).shuffle(shuffled)
-    pairs = select_pairs(numbered(200), PairConfig(window=5, retrieval_top=4), Looks(shuffled))
+    pairs = select_pairs(numbered(200), PairConfig(window=5, retrieval_top=4), PlantedAppearance(shuffled))
     assert set(pairs) == on_circle(shuffled, 2)
 
 
 def test_names_without_numbers_make_no_sequence():
     words = sorted("".join(letters) for letters in itertools.product("abcdef", repeat=3))
-    assert set(select_pairs(words, PairConfig(retrieval_top=4), Looks())) == on_circle(words, 2)
+    assert set(select_pairs(words, PairConfig(retrieval_top=4), PlantedAppearance())) == on_circle(words, 2)
 
 
 def test_frames_named_by_their_milliseconds_are_a_sequence():
     frames = [f"walk_{i * 500:08d}.jpg" for i in range(100)]
-    pairs = select_pairs(frames, PairConfig(window=5, retrieval_top=4), Looks())
+    pairs = select_pairs(frames, PairConfig(window=5, retrieval_top=4), PlantedAppearance())
     within = {ImagePair.of(one, other) for i, one in enumerate(frames) for other in frames[i + 1 : i + 6]}
     assert within <= set(pairs)
 
 
 def test_retrieval_takes_no_more_than_there_are():
-    looks = Looks()
-    pairs = select_pairs(numbered(6), PairConfig(mode="retrieval", retrieval_top=20), looks)
-    assert looks.asked == [(5, 0)] and set(pairs) == on_circle(in_order(6), 2)
+    appearance = PlantedAppearance()
+    pairs = select_pairs(numbered(6), PairConfig(mode="retrieval", retrieval_top=20), appearance)
+    assert appearance.asked == [(5, 0)] and set(pairs) == on_circle(in_order(6), 2)
 
 
 def test_a_pair_that_one_of_the_two_proposes_is_taken_once():
-    found = np.array([[1, 2], [0, -1], [-1, -1]])
-    pairs = select_pairs(["a", "b", "c"], PairConfig(mode="retrieval"), lambda names, top, gap: found)
+    similar = np.array([[1, 2], [0, -1], [-1, -1]])
+    pairs = select_pairs(["a", "b", "c"], PairConfig(mode="retrieval"), lambda names, top, gap: similar)
     assert pairs == (ImagePair("a", "b"), ImagePair("a", "c"))
 
 
@@ -137,9 +137,9 @@ def test_retrieval_that_finds_nothing_is_told():
 
 
 def test_a_sequence_closes_its_loops_by_looks():
-    looks = Looks()
-    pairs = select_pairs(numbered(100), PairConfig(mode="sequential", window=3, loop_top=2), looks)
-    assert looks.asked == [(2, 12)]
+    appearance = PlantedAppearance()
+    pairs = select_pairs(numbered(100), PairConfig(mode="sequential", window=3, loop_top=2), appearance)
+    assert appearance.asked == [(2, 12)]
     assert set(pairs) == set(pair_sequentially(numbered(100), 3)) | {
         ImagePair.of(f"img{i}.jpg", f"img{(i + 13) % 100}.jpg") for i in range(100)
     }
@@ -171,8 +171,8 @@ def test_spatial_says_what_it_lacks(caplog):
 
 def test_auto_adds_neighbours_by_position():
     positions = {f"img{i}.jpg": (48.0, 8.5, 100.0) for i in (0, 50)}
-    pairs = select_pairs(numbered(100), PairConfig(retrieval_top=2), Looks(), positions)
-    without = select_pairs(numbered(100), PairConfig(retrieval_top=2), Looks())
+    pairs = select_pairs(numbered(100), PairConfig(retrieval_top=2), PlantedAppearance(), positions)
+    without = select_pairs(numbered(100), PairConfig(retrieval_top=2), PlantedAppearance())
     assert set(pairs) - set(without) == {ImagePair.of("img0.jpg", "img50.jpg")}
 
 

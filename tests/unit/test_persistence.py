@@ -55,29 +55,29 @@ def persist(photos, pairs, config=CONFIG):
     """persist_keypoints, checked for what always holds: {name: Keypoints}, {pair: IndexMatches}, tracks."""
     by_pair = {matches.pair: matches for matches in pairs}
     keypoints, matches = persist_keypoints(photos, list(by_pair), by_pair.__getitem__, config, quiet=True)
-    assert [found.name for found in keypoints] == [photo.name for photo in photos]
-    for found, photo in zip(keypoints, photos):
-        assert ((found.xy >= 0) & (found.xy <= photo.size_wh)).all()
-        assert np.isfinite(found.sigma_px).all() and (found.sigma_px >= 0).all()
-        assert ((found.score > 0) & (found.score <= 1)).all()
-    keypoints = {found.name: found for found in keypoints}
-    assert len({found.pair for found in matches}) == len(matches)
-    for found in matches:
-        assert len(found) and found.pair in by_pair
-        assert found.indices[:, 0].max() < len(keypoints[found.pair.name0])
-        assert found.indices[:, 1].max() < len(keypoints[found.pair.name1])
+    assert [points.name for points in keypoints] == [photo.name for photo in photos]
+    for points, photo in zip(keypoints, photos):
+        assert ((points.xy >= 0) & (points.xy <= photo.size_wh)).all()
+        assert np.isfinite(points.sigma_px).all() and (points.sigma_px >= 0).all()
+        assert ((points.score > 0) & (points.score <= 1)).all()
+    keypoints = {points.name: points for points in keypoints}
+    assert len({pair_matches.pair for pair_matches in matches}) == len(matches)
+    for pair_matches in matches:
+        assert len(pair_matches) and pair_matches.pair in by_pair
+        assert pair_matches.indices[:, 0].max() < len(keypoints[pair_matches.pair.name0])
+        assert pair_matches.indices[:, 1].max() < len(keypoints[pair_matches.pair.name1])
     tracks = find_tracks(matches)
     for track in tracks:
         assert len({name for name, _ in track}) == len(track), "two keypoints of one image in a track"
-    return keypoints, {found.pair: found for found in matches}, tracks
+    return keypoints, {pair_matches.pair: pair_matches for pair_matches in matches}, tracks
 
 
 def find_tracks(matches) -> list[frozenset[tuple[str, int]]]:
     """The tracks that matches say, by a naive union-find."""
     track_of: dict[tuple[str, int], set] = {}
-    for found in matches:
-        for a, b in found.indices.tolist():
-            one, other = (found.pair.name0, a), (found.pair.name1, b)
+    for pair_matches in matches:
+        for a, b in pair_matches.indices.tolist():
+            one, other = (pair_matches.pair.name0, a), (pair_matches.pair.name1, b)
             joined = track_of.get(one, {one}) | track_of.get(other, {other})
             for keypoint in joined:
                 track_of[keypoint] = joined
@@ -196,12 +196,12 @@ def test_pairs_without_matches_and_images_without_pairs():
 
 def test_no_pairs_at_all():
     keypoints, matches, _ = persist([make_photo("a", (4.0, 4.0)), make_photo("b")], [])
-    assert not matches and all(len(found) == 0 for found in keypoints.values())
+    assert not matches and all(len(points) == 0 for points in keypoints.values())
 
 
 def test_photos_without_seeds():
     keypoints, matches, _ = persist([make_photo("a"), make_photo("b")], [make_pair("a", "b", np.eye(3))])
-    assert not matches and all(len(found) == 0 for found in keypoints.values())
+    assert not matches and all(len(points) == 0 for points in keypoints.values())
 
 
 # A plane seen from several sides
@@ -250,17 +250,17 @@ def test_tracks_on_a_plane_are_long(persisted):
 def test_keypoints_of_a_plane_are_where_the_homographies_say(scene, persisted):
     keypoints, matches, _ = persisted
     for pair in scene[1]:
-        found = matches[pair.pair]
+        shared = matches[pair.pair]
         xy0, xy1 = keypoints[pair.pair.name0].xy, keypoints[pair.pair.name1].xy
         ground_truth = pair.homography[:1] / pair.homography[0, 2, 2]
-        expected = apply_homographies(np.tile(ground_truth, (len(found), 1, 1)), xy0[found.indices[:, 0]])
-        np.testing.assert_allclose(xy1[found.indices[:, 1]], expected, atol=0.02)
+        expected = apply_homographies(np.tile(ground_truth, (len(shared), 1, 1)), xy0[shared.indices[:, 0]])
+        np.testing.assert_allclose(xy1[shared.indices[:, 1]], expected, atol=0.02)
 
 
 def test_keypoints_on_a_plane_keep_their_distance(persisted):
-    for found in persisted[0].values():
-        apart = np.linalg.norm(found.xy[:, None] - found.xy[None], axis=2)
-        assert apart[~np.eye(len(found), dtype=bool)].min() > CONFIG.separation_px - 0.02
+    for points in persisted[0].values():
+        apart = np.linalg.norm(points.xy[:, None] - points.xy[None], axis=2)
+        assert apart[~np.eye(len(points), dtype=bool)].min() > CONFIG.separation_px - 0.02
 
 
 @pytest.mark.parametrize("names", ["edcba", "bdaec"])
@@ -268,50 +268,50 @@ def test_names_do_not_matter(persisted, names):
     keypoints, _, tracks = persist(*make_scene(names))
     assert sorted(map(len, tracks)) == sorted(map(len, persisted[2]))
     for name, original in zip(names, "abcde"):
-        found, expected = keypoints[name].xy, persisted[0][original].xy
-        assert len(found) == len(expected)
-        apart = np.linalg.norm(found[:, None] - expected[None], axis=2)
+        actual, expected = keypoints[name].xy, persisted[0][original].xy
+        assert len(actual) == len(expected)
+        apart = np.linalg.norm(actual[:, None] - expected[None], axis=2)
         assert apart.min(axis=1).max() < 0.05 and apart.min(axis=0).max() < 0.05
 
 
 def test_the_order_of_the_photos_does_not_matter(scene, persisted):
     photos, pairs = scene
     keypoints, matches, _ = persist(photos[::-1], pairs)
-    for name, found in keypoints.items():
-        assert len(found) == len(persisted[0][name])
+    for name, points in keypoints.items():
+        assert len(points) == len(persisted[0][name])
         np.testing.assert_allclose(
-            found.xy[np.lexsort(found.xy.T.round(1))],
+            points.xy[np.lexsort(points.xy.T.round(1))],
             persisted[0][name].xy[np.lexsort(persisted[0][name].xy.T.round(1))],
             atol=0.05,
         )
-    assert {pair: len(found) for pair, found in matches.items()} == {
-        pair: len(found) for pair, found in persisted[1].items()
+    assert {pair: len(shared) for pair, shared in matches.items()} == {
+        pair: len(shared) for pair, shared in persisted[1].items()
     }
 
 
 def test_the_same_input_gives_the_same_result(scene, persisted):
     keypoints, matches, _ = persist(*scene)
-    for name, found in keypoints.items():
-        assert found.xy.tobytes() == persisted[0][name].xy.tobytes()
-    for pair, found in matches.items():
-        assert found.indices.tobytes() == persisted[1][pair].indices.tobytes()
+    for name, points in keypoints.items():
+        assert points.xy.tobytes() == persisted[0][name].xy.tobytes()
+    for pair, shared in matches.items():
+        assert shared.indices.tobytes() == persisted[1][pair].indices.tobytes()
 
 
 def test_selection_takes_longer_tracks_and_spreads(scene, persisted):
     most = 40
     keypoints, _, tracks = persist(*scene, dataclasses.replace(CONFIG, max_keypoints=most))
-    counts = [len(found) for found in keypoints.values()]
+    counts = [len(points) for points in keypoints.values()]
     assert max(counts) <= 2 * most and np.mean(counts) <= 1.3 * most and min(counts) >= most / 2
     assert np.mean([len(track) for track in tracks]) > np.mean([len(track) for track in persisted[2]])
-    for found in keypoints.values():
-        quarters = {tuple(quarter) for quarter in (found.xy // (np.array(SIZE_WH) / 2)).tolist()}
+    for points in keypoints.values():
+        quarters = {tuple(quarter) for quarter in (points.xy // (np.array(SIZE_WH) / 2)).tolist()}
         assert len(quarters) == 4
 
 
 def test_a_high_limit_changes_nothing(scene, persisted):
     keypoints, _, _ = persist(*scene, dataclasses.replace(CONFIG, max_keypoints=100_000))
-    assert {name: len(found) for name, found in keypoints.items()} == {
-        name: len(found) for name, found in persisted[0].items()
+    assert {name: len(points) for name, points in keypoints.items()} == {
+        name: len(points) for name, points in persisted[0].items()
     }
 
 
@@ -337,10 +337,10 @@ def test_pruned_edges_are_those_of_selected_keypoints(scene):
         collect_keypoints(graph, config),
         collect_keypoints(pruned, config),
     )
-    for found, again in zip(keypoints, again_keypoints, strict=True):
-        np.testing.assert_allclose(found.xy, again.xy, atol=0.02)
-    for found, again in zip(matches, again_matches, strict=True):
-        assert found.pair == again.pair and np.array_equal(found.indices, again.indices)
+    for first, again in zip(keypoints, again_keypoints, strict=True):
+        np.testing.assert_allclose(first.xy, again.xy, atol=0.02)
+    for first, again in zip(matches, again_matches, strict=True):
+        assert first.pair == again.pair and np.array_equal(first.indices, again.indices)
 
 
 def test_nothing_is_pruned_to_nothing():
@@ -391,10 +391,10 @@ def test_matches_are_grouped_by_pair_in_the_order_of_names():
         jacobian=np.zeros((3, 2, 2)),
         score=np.array([0.5, 0.7, 0.2]),
     )
-    (found,) = group_matches(["z", "a"], graph, index)
-    assert found.pair == ImagePair("a", "z")
-    assert found.indices.tolist() == [[0, 0], [1, 1]]
-    np.testing.assert_allclose(found.score, [0.7, 0.2])
+    (shared,) = group_matches(["z", "a"], graph, index)
+    assert shared.pair == ImagePair("a", "z")
+    assert shared.indices.tolist() == [[0, 0], [1, 1]]
+    np.testing.assert_allclose(shared.score, [0.7, 0.2])
 
 
 # Settings
@@ -459,4 +459,4 @@ def test_what_is_refined_are_the_edges_that_tracks_use_and_its_result_is_what_co
 
     _, matches = persist_keypoints(scene[0], list(by_pair), by_pair.__getitem__, config, refiner=Refiner(), quiet=True)
     assert [len(edges.source) for edges in given[0].edges] == [len(edges.source) for edges in pruned.edges]
-    assert ImagePair("a", "b") not in {found.pair for found in matches} and len(matches) == len(by_pair) - 1
+    assert ImagePair("a", "b") not in {shared.pair for shared in matches} and len(matches) == len(by_pair) - 1

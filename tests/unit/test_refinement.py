@@ -147,7 +147,7 @@ def test_the_keypoints_of_tracks_end_where_they_should(photos, refined):
     xy0, xy1 = (keypoints[side].xy[matches[0].indices[:, side]] for side in (0, 1))
     errors = np.linalg.norm(true_xy(B_FROM_A, xy0) - xy1, axis=1)
     assert len(errors) > 200 and np.median(errors) < 0.25
-    assert [found.name for found in keypoints] == [photo.name for photo in photos]
+    assert [each.name for each in keypoints] == [photo.name for photo in photos]
 
 
 def test_photos_of_the_matching_resolution_keep_their_scale(photos, matcher, tmp_path, many):

@@ -41,13 +41,13 @@ class Ring:
 
     def __init__(self, count: int, landmarks: int = 400, seen: int = 100) -> None:
         rng = np.random.default_rng(0)
-        looks = normalise(rng.normal(size=(landmarks, CHANNELS)))
+        appearance = normalise(rng.normal(size=(landmarks, CHANNELS)))
         self.cells = {}
         for i in range(count):
             arc = (np.arange(seen) + i * landmarks // count) % landmarks
             noise = normalise(rng.normal(size=(seen // 4, CHANNELS)))
             self.cells[f"{i:03d}.jpg"] = normalise(
-                np.concatenate([looks[arc] + 0.05 * rng.normal(size=(seen, CHANNELS)), noise])
+                np.concatenate([appearance[arc] + 0.05 * rng.normal(size=(seen, CHANNELS)), noise])
             )
         self.images = [ImageRef(name, name, (640, 480)) for name in self.cells]
         self.digests = {name: f"{i:016x}" for i, name in enumerate(self.cells)}
@@ -70,8 +70,8 @@ def ring(monkeypatch) -> Ring:
 
 
 def test_photos_of_the_same_part_are_found(ring, tmp_path):
-    found = find_similar(ring.describe(tmp_path), 8)
-    steps = (found - np.arange(60)[:, None] + 30) % 60 - 30
+    similar = find_similar(ring.describe(tmp_path), 8)
+    steps = (similar - np.arange(60)[:, None] + 30) % 60 - 30
     # 15 photos farther on, nothing is in common.
     assert (np.abs(steps) <= 6).mean() > 0.95
     assert set(steps[:, 0].tolist()) <= {-2, -1, 1, 2}
@@ -204,8 +204,8 @@ def test_flat_photos_resemble_each_other_and_no_others(ring, tmp_path):
     flat = normalise(np.ones((50, CHANNELS)))
     for name in ("003.jpg", "030.jpg", "031.jpg"):
         ring.cells[name] = flat
-    found = find_similar(ring.describe(tmp_path), 2)
-    assert [set(found[i].tolist()) for i in (3, 30, 31)] == [{30, 31}, {3, 31}, {3, 30}]
+    similar = find_similar(ring.describe(tmp_path), 2)
+    assert [set(similar[i].tolist()) for i in (3, 30, 31)] == [{30, 31}, {3, 31}, {3, 30}]
     for name in ring.cells:
         ring.cells[name] = flat
     descriptors = ring.describe(tmp_path / "all")

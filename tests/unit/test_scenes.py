@@ -58,7 +58,7 @@ def draw_test_scene(photos, seed):
     return draw_scene(photos, views, rng), views
 
 
-# Truth
+# Ground truth
 
 
 def test_a_plane_homography_carries_the_projections_of_its_points():

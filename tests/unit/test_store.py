@@ -29,9 +29,9 @@ def make_matches(name0: str, name1: str, count: int = 5) -> PairMatches:
     )
 
 
-def assert_same(found: PairMatches, expected: PairMatches) -> None:
+def assert_same(actual: PairMatches, expected: PairMatches) -> None:
     for field in dataclasses.fields(PairMatches):
-        one, other = getattr(found, field.name), getattr(expected, field.name)
+        one, other = getattr(actual, field.name), getattr(expected, field.name)
         if isinstance(one, np.ndarray):
             assert one.dtype == other.dtype and one.tobytes() == other.tobytes(), field.name
         else:
@@ -144,21 +144,21 @@ def test_a_crash_while_merging_loses_nothing(tmp_path, batch, monkeypatch):
 
 @pytest.mark.parametrize("merged", [False, True])
 @pytest.mark.parametrize(
-    ("changed", "key", "found", "wanted"),
+    ("changed", "key", "stored", "wanted"),
     [
         ({"matching.max_matches": 100}, "matching.max_matches", "8000", "100"),
         ({"weights": "xyz"}, "weights", "'abc'", "'xyz'"),
         ({"network.new": 1}, "network.new", "None", "1"),
     ],
 )
-def test_matches_of_another_configuration_are_refused(tmp_path, batch, merged, changed, key, found, wanted):
+def test_matches_of_another_configuration_are_refused(tmp_path, batch, merged, changed, key, stored, wanted):
     store = open_store(tmp_path)
     store.write(batch)
     if merged:
         store.merge()
     with pytest.raises(StaleResultError) as error:
         open_store(tmp_path, MADE_BY | changed)
-    assert all(part in str(error.value) for part in (str(tmp_path), key, found, wanted))
+    assert all(part in str(error.value) for part in (str(tmp_path), key, stored, wanted))
     assert batch[0].pair in open_store(tmp_path)
 
 

@@ -148,7 +148,7 @@ class Keypoints:
     sigma_px: np.ndarray
     """(K,) float32: estimated standard deviation of the position."""
     score: np.ndarray
-    """(K,) float32."""
+    """(K,) float32: higher is better. Of persistent keypoints it is the share of all photos that show their track."""
 
     def __post_init__(self) -> None:
         count = len(self.score)
@@ -168,7 +168,7 @@ class IndexMatches:
     indices: np.ndarray
     """(M, 2) uint32: keypoint of image 0, keypoint of image 1."""
     score: np.ndarray
-    """(M,) float32."""
+    """(M,) float32: higher is better. Of persistent keypoints it is a probability, as in PatchMatches."""
 
     def __post_init__(self) -> None:
         count = len(self.score)
@@ -227,7 +227,7 @@ class Tracks:
 
 @dataclass(frozen=True)
 class PinholeView:
-    """A camera whose intrinsics and pose are known: a view to render, or the truth about a photo."""
+    """A camera whose intrinsics and pose are known: a view to render, or the ground truth of a photo."""
 
     K: np.ndarray
     """(3, 3) float64 px, in COLMAP's frame."""
@@ -255,7 +255,7 @@ class PinholeView:
 
 @dataclass(frozen=True)
 class MappingResult:
-    """The models that the mapper built, and the figures of summary.json about the largest of them."""
+    """The models that the mapper built, and the metrics in summary.json of the largest of them."""
 
     models: tuple[Any, ...]
     """pycolmap.Reconstruction, largest (most registered images) first."""

@@ -133,14 +133,12 @@ def run_demo(options: argparse.Namespace) -> int:
 
 
 def run_show(options: argparse.Namespace) -> int:
-    from hm_sfm.matching.matcher import HomoMatcher
+    from hm_sfm.pipeline.run import load_matcher
     from hm_sfm.report.pair_picture import check_picture_path, draw_pair, write_picture
 
     check_picture_path(options.picture)
     config = read_config(options)
-    matcher = HomoMatcher.from_pretrained(
-        config.matching.model, config=config.matching, images=config.images, network=config.network
-    )
+    matcher = load_matcher(config)
     shown = draw_pair(matcher, options.photo_a, options.photo_b, config.verification)
     write_picture(options.picture, shown.picture)
     print(
@@ -156,14 +154,12 @@ def run_evaluate(options: argparse.Namespace) -> int:
     from hm_sfm.evaluation.match_pictures import MatchPictures
     from hm_sfm.evaluation.points import score_points
     from hm_sfm.evaluation.relative_poses import read_strecha_pairs, read_superglue_pairs, score_poses
-    from hm_sfm.matching.matcher import HomoMatcher
+    from hm_sfm.pipeline.run import load_matcher
     from hm_sfm.training.photos import load_photos
     from hm_sfm.training.validation import make_validation_pairs
 
     config = read_config(options)
-    matcher = HomoMatcher.from_pretrained(
-        config.matching.model, config=config.matching, images=config.images, network=config.network
-    )
+    matcher = load_matcher(config)
     pictures = MatchPictures(options.pictures) if options.pictures else None
     if options.task == "points":
         pairs = make_validation_pairs(load_photos(options.data), options.kind, options.count)

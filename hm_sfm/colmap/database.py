@@ -44,7 +44,7 @@ def write_database(
     image_ids = {image.name: image_id for image_id, image in enumerate(images, start=1)}
     for image, points in zip(images, keypoints):
         if points.name != image.name:
-            raise ValueError(f"keypoints of {points.name!r} stand in the place of image {image.name!r}")
+            raise ValueError(f"keypoints of {points.name!r} are given for the image {image.name!r}")
     for pair_matches in matches:
         _check_matches(pair_matches, keypoints, image_ids)
 
@@ -58,17 +58,7 @@ def write_database(
                 rig.add_ref_sensor(camera.sensor_id)
                 database.write_rig(rig, use_rig_id=True)
             for image, index, points in zip(images, cameras.camera_index, keypoints):
-                image_id = image_ids[image.name]
-                row = pycolmap.Image(name=image.name, camera_id=cameras.cameras[index].camera_id, image_id=image_id)
-                database.write_image(row, use_image_id=True)
-                frame = pycolmap.Frame(frame_id=image_id, rig_id=row.camera_id)
-                frame.add_data_id(row.data_id)
-                database.write_frame(frame, use_frame_id=True)
-                database.write_keypoints(image_id, points.xy)
-                if image.gps:
-                    wgs84 = pycolmap.PosePriorCoordinateSystem.WGS84
-                    prior = pycolmap.PosePrior(position=image.gps, coordinate_system=wgs84, corr_data_id=row.data_id)
-                    database.write_pose_prior(prior)
+                _write_image(database, image_ids[image.name], image, cameras.cameras[index].camera_id, points)
             for pair_matches in matches:
                 if len(pair_matches):
                     pair = pair_matches.pair
@@ -81,6 +71,22 @@ def write_database(
     finally:
         temporary.unlink(missing_ok=True)
         _remove_leftovers(temporary)
+
+
+def _write_image(
+    database: pycolmap.Database, image_id: int, image: ImageRef, camera_id: int, keypoints: Keypoints
+) -> None:
+    """The rows of one image: the image, a frame of its own, its keypoints and, with GPS, its pose prior."""
+    row = pycolmap.Image(name=image.name, camera_id=camera_id, image_id=image_id)
+    database.write_image(row, use_image_id=True)
+    frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
+    frame.add_data_id(row.data_id)
+    database.write_frame(frame, use_frame_id=True)
+    database.write_keypoints(image_id, keypoints.xy)
+    if image.gps:
+        wgs84 = pycolmap.PosePriorCoordinateSystem.WGS84
+        prior = pycolmap.PosePrior(position=image.gps, coordinate_system=wgs84, corr_data_id=row.data_id)
+        database.write_pose_prior(prior)
 
 
 def _check_matches(matches: IndexMatches, keypoints: Sequence[Keypoints], image_ids: dict[str, int]) -> None:

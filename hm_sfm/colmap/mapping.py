@@ -112,7 +112,7 @@ def calibrate_rigs(task: MappingTask, rigs: Sequence[pycolmap.RigConfig]) -> boo
     if not is_complete:
         logger.warning(
             "the rigs are left out: no model has photos of all their cameras, from which the missing "
-            "cam_from_rig_rotation and cam_from_rig_translation could be found"
+            "cam_from_rig_rotation and cam_from_rig_translation could be estimated"
         )
     return is_complete
 

@@ -82,7 +82,7 @@ def read_rigs(path: Path) -> tuple[pycolmap.RigConfig, ...]:
     has_pose = {camera.cam_from_rig is not None for rig in rigs for camera in rig.cameras if not camera.ref_sensor}
     if len(has_pose) > 1:  # calibrated ones would have another scale than those that are known
         raise InputError(
-            f"{path} has a cam_from_rig of some cameras only: give it of all but those with ref_sensor, or none"
+            f"{path} has a cam_from_rig for some cameras only: give it for all but those with ref_sensor, or for none"
         )
     return tuple(rigs)
 
@@ -154,8 +154,8 @@ def assign_cameras(
     for taker, prefix in prefixes.items():
         if taker not in joined and len(rigs[taker[0]].cameras) > 1:
             raise InputError(
-                f"{path} does not match: behind {prefix!r} no photo is named as one of another camera of the rig is, "
-                "which says that they were taken at the same moment"
+                f"{path} does not match: no photo in {prefix!r} has the same name as one of another camera of the rig, "
+                "which would mean that both were taken at the same moment"
             )
     return taken_by
 

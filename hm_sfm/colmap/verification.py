@@ -110,7 +110,7 @@ def verify_pair(
 
 
 def _epipolar_inliers(xy0: np.ndarray, xy1: np.ndarray, matrix: np.ndarray, max_error: float) -> np.ndarray:
-    """(M,) bool: Sampson error within `max_error`, in the units of the points; points (M, 2), NaN is no inlier."""
+    """(M,) bool: Sampson error within `max_error`, px or normalised as the points (M, 2) are; NaN is no inlier."""
     squared = np.array(pycolmap.compute_squared_sampson_error(xy0, xy1, matrix))
     return squared <= max_error**2
 

@@ -38,7 +38,7 @@ def score_homographies(
     """
     sequences = sorted(path.parent for path in Path(folder).glob("*/H_1_2"))
     if not sequences:
-        raise InputError(f"{folder} is no folder in HPatches' layout: no */H_1_2 there")
+        raise InputError(f"{folder} is not a folder in HPatches' layout: it has no */H_1_2")
     errors, counts = [], []
     cache = FeatureCache(matcher, _prepare_short_edge)
     for sequence in tqdm(sequences, desc="homographies", unit="sequence", disable=quiet):

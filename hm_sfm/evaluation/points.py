@@ -24,7 +24,7 @@ class MatchErrors:
     """The M matches of a pair against the ground truth; an error is NaN where image 1 does not show the true point."""
 
     score: np.ndarray
-    """(M,) float32."""
+    """(M,) float32, as in PatchMatches."""
     centre_px: np.ndarray
     """(M,) float64: of the patch centres."""
     points_px: np.ndarray

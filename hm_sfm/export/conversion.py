@@ -65,7 +65,7 @@ def find_photos(out: Path, image_folder: Path | None) -> Path:
         try:
             image_folder = Path(json.loads((out / "summary.json").read_text())["image_folder"])
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{out / 'summary.json'} does not say where the photos are: name --images") from error
+            raise InputError(f"{out / 'summary.json'} does not say where the photos are: give --images") from error
     if not Path(image_folder).is_dir():
         raise InputError(f"the folder of photos {image_folder} does not exist: name it with --images")
     return Path(image_folder)

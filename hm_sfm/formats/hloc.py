@@ -82,7 +82,7 @@ def read_features(path: Path, images: Sequence[ImageRef]) -> tuple[Keypoints, ..
         if missing:
             raise InputError(
                 f"{path} has no keypoints of {len(missing)} of {len(images)} images, for example {missing[0]!r} (it "
-                f"has some of {min(h5, default='nothing')!r}): it is of other photos, or of another list of pairs"
+                f"has some of {min(h5, default='nothing')!r}): it belongs to other photos, or to another list of pairs"
             )
         return tuple(read_keypoints(h5[image.name], path, image) for image in images)
 
@@ -99,12 +99,12 @@ def read_keypoints(group: object, path: Path, image: ImageRef) -> Keypoints:
         width, height = size_wh
         raise InputError(
             f"{path} has the keypoints of an image {image.name!r} of {width} x {height} px, the photo has "
-            f"{image.size_wh[0]} x {image.size_wh[1]} px: it is of other photos, or of photos rotated as EXIF says"
+            f"{image.size_wh[0]} x {image.size_wh[1]} px: it belongs to other photos, or to photos rotated as EXIF says"
         )
     xy = px_from_pixel_index(data.astype(np.float32))
     # Half precision rounds to whole pixels from 1024 on: a point at the edge may come to lie a bit outside.
     if not np.all((xy >= -1) & (xy <= np.array(image.size_wh) + 1)):
-        raise InputError(f"{path} has keypoints outside of {image.name!r}: it is of other photos")
+        raise InputError(f"{path} has keypoints outside of {image.name!r}: it belongs to other photos")
     uncertainty = read_attributes(group["keypoints"]).get("uncertainty", 1.0)
     sigma = read_array(group, "sigma_px") if "sigma_px" in group else np.full(len(xy), uncertainty)
     score = next((read_array(group, name) for name in ("scores", "score") if name in group), np.ones(len(xy)))
@@ -127,7 +127,7 @@ def read_matches(path: Path, pairs: Sequence[ImagePair], keypoints: Sequence[Key
         if missing:
             raise InputError(
                 f"{path} lacks {len(missing)} of {len(pairs)} pairs, for example {missing[0].name0!r} and "
-                f"{missing[0].name1!r}: it is of another run, or was made from another list of pairs"
+                f"{missing[0].name1!r}: it belongs to another run, or was made from another list of pairs"
             )
         return tuple(read_pair(h5, path, pair, *group, count_of) for pair, group in zip(pairs, groups) if group)
 

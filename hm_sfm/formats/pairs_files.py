@@ -86,7 +86,7 @@ def _parse_line(line: str, where: str) -> tuple[str, str]:
 
 def _quote(name: str) -> str:
     if "\n" in name or "\r" in name:
-        raise InputError(f"the image name {name!r} holds a line break, which a pairs file cannot")
+        raise InputError(f"the image name {name!r} contains a line break, which a pairs file cannot hold")
     return name if BARE_NAME.fullmatch(name) else '"' + name.replace('"', '""') + '"'
 
 

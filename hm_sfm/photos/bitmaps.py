@@ -28,8 +28,8 @@ def can_read_heic() -> bool:
 def read_bitmap(path: Path, as_rgb: bool) -> pycolmap.Bitmap | None:
     """The stored pixels of an image file, with its EXIF, in RGB or grey; None where it cannot be decoded.
 
-    HEIC has the turn of a photo in its pixels' own description, not in EXIF: they come upright, and so does the EXIF
-    orientation. EXIF of WebP is not read. Raises MissingPackageError where HEIC needs a package that is not installed.
+    HEIC files state the rotation of a photo outside of EXIF: the pixels come upright, and the EXIF orientation says so.
+    EXIF of WebP is not read. Raises MissingPackageError where HEIC needs a package that is not installed.
     """
     bitmap = pycolmap.Bitmap.read(path, as_rgb=as_rgb)
     extension = Path(path).suffix.lower()
@@ -67,8 +67,8 @@ def _read_webp(path: Path, as_rgb: bool) -> pycolmap.Bitmap | None:
 def open_to_colmap(images: Sequence[ImageRef], image_folder: Path) -> Iterator[Path]:
     """A folder in which COLMAP can read all the images by their names.
 
-    That is image_folder, where COLMAP can read them all. Otherwise it is a temporary one with links to the files, and
-    with JPEGs, under the same names, in the place of those that COLMAP cannot read: it goes by the content.
+    That is image_folder, where COLMAP can read them all. Otherwise it is a temporary one with symbolic links to the
+    files, and with JPEGs in place of those that COLMAP cannot read. These keep their names: COLMAP goes by the content.
     """
     if not any(image.path.suffix.lower() in FOREIGN_EXTENSIONS for image in images):
         yield Path(image_folder)

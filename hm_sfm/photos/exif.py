@@ -1,4 +1,4 @@
-"""JPEG files that carry a focal length and an orientation in EXIF, as a camera writes them.
+"""JPEG files with a focal length and an orientation in EXIF, as a camera writes them.
 
 Only writing: reading EXIF is pycolmap's job.
 """

@@ -23,11 +23,11 @@ logger = logging.getLogger(__name__)
 FORMATS = ("jpg", "png")
 TABLE = "frames.csv"
 MARKER = ".frames"
-"""File by which a folder is known to hold the frames of a video, chosen in a certain way."""
+"""File that marks a folder as the frames of a video, and says how they were chosen."""
 SHARPNESS_EDGE_PX = 1024
 """Sharpness is measured at the size that photos are matched at: noise and compression look sharp in larger frames."""
 LOST_SHARE = 0.1
-"""Of the frames that a video says to have: if more cannot be decoded, that is worth a warning."""
+"""Share of the frames that a video declares: if more than these cannot be decoded, a warning says so."""
 
 
 def extract_frames(
@@ -42,7 +42,8 @@ def extract_frames(
     Returns the image names, relative to image_folder, with seconds from the start of their video.
 
     Raises ConfigError on an impossible interval or format, InputError where a video cannot be decoded, two would have
-    the same folder, or that folder holds anything else. All but damage further inside a video is found at the start.
+    the same folder, or that folder holds anything else. All of this
+    is checked before anything is written, except for damage further inside a video.
     """
     image_folder = Path(image_folder)
     if not (math.isfinite(every_s) and every_s >= 0.001):

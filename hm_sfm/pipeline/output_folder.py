@@ -13,7 +13,7 @@ from hm_sfm.network.checkpoints import digest_weights
 from hm_sfm.types import ImageRef
 
 MARKER = ".hm_sfm"
-"""File by which a folder is known as the output of a run."""
+"""File that marks a folder as the output of a run."""
 MATCHES_FILE = "matches.h5"
 UNDESCRIBED = {
     ("matching", key)
@@ -25,7 +25,7 @@ UNDESCRIBED = {
 def claim_folder(out: Path, shared: bool = False) -> None:
     """Make OUT, or check that it is empty or an earlier run's, and lock it, see hm_sfm.io.locks.
 
-    shared: with other processes that share it. Raises InputError where OUT is somebody else's, not writable, or in use.
+    shared: with other processes that share it. Raises InputError where OUT holds other files, is not writable or in use.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)

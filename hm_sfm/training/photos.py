@@ -41,7 +41,7 @@ class WarpRange:
 def load_photos(folder: Path) -> list[np.ndarray]:
     """All photos of a folder tree, sorted by path, grey (H, W) uint8, long edge at most 640 px.
 
-    Unreadable files are skipped with a warning. Raises InputError where nothing usable is found.
+    Unreadable files are skipped with a warning. Raises InputError where there is no usable photo.
     """
     folder = Path(folder)
     if not folder.is_dir():

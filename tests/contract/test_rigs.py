@@ -281,7 +281,11 @@ def test_photos_of_one_camera_have_one_size(tmp_path):
     [
         ("middle/", ["left/1.jpg", "right/1.jpg"], "rig.json does not match: no photo .* begins with 'middle/'"),
         ("l", ["left/1.jpg", "right/1.jpg"], "'left/1.jpg' is of two cameras .* 'left/' and 'l': end each .* with a /"),
-        ("right/", ["left/1.jpg", "right/2.jpg"], "does not match: behind 'left/' no photo is named as one of another"),
+        (
+            "right/",
+            ["left/1.jpg", "right/2.jpg"],
+            "does not match: no photo in 'left/' has the same name as one of another",
+        ),
         (
             "right/",
             ["left/1.jpg", "left/left/1.jpg", "right/1.jpg"],
@@ -315,7 +319,7 @@ def test_rigs_of_other_photos(tmp_path, prefix, names, message):
         ([{"cameras": [{"image_prefix": "", "ref_sensor": True}]}], "needs an image_prefix"),
         (
             [RIG[0], {"cameras": [{"image_prefix": "a", "ref_sensor": True}, {"image_prefix": "b"}]}],
-            "of some cameras only",
+            "for some cameras only",
         ),
         ([{"cameras": ["left/"]}], "camera 1 of rig 1 in .*rig.json must be a mapping"),
     ],

@@ -25,7 +25,7 @@ UNDESCRIBED = {
 def claim_folder(out: Path, shared: bool = False) -> None:
     """Make OUT, or check that it is empty or an earlier run's, and lock it, see hm_sfm.io.locks.
 
-    shared: with other processes that share it. Raises InputError where OUT holds other files, is not writable or in use.
+    shared: with other processes that share it. Raises InputError where OUT is not a run, not writable, or in use.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)

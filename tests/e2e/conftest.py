@@ -3,6 +3,7 @@
 import ctypes
 import dataclasses
 import hashlib
+import importlib
 import os
 import shutil
 import subprocess
@@ -182,3 +183,10 @@ def tiny_photos(tmp_path_factory) -> Path:
         crop = texture[4 + number : 68 + number, 6 * number : 6 * number + 96]
         cv2.imwrite(str(folder / f"{number}.png"), crop)
     return folder
+
+
+@pytest.fixture
+def load_benchmark(monkeypatch) -> Callable[[str], Any]:
+    """Import a module of pipelines/benchmarks/, which is no package: its scripts find each other by their folder."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "pipelines" / "benchmarks")
+    return importlib.import_module

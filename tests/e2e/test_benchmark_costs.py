@@ -1,30 +1,20 @@
 """The benchmark of time and memory, on small photos and without the packages that it compares with."""
 
-import importlib
 import json
 import sys
 from pathlib import Path
 
 import pytest
 
-BENCHMARKS = Path(__file__).parents[2] / "pipelines" / "benchmarks"
-
 
 @pytest.fixture
-def load(monkeypatch):
-    """Import a module of pipelines/benchmarks/, which is no package: its scripts find each other by their folder."""
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    return importlib.import_module
-
-
-@pytest.fixture
-def run_benchmark(load, monkeypatch, capfd):
+def run_benchmark(load_benchmark, monkeypatch, capfd):
     """Run the benchmark with its arguments and return what it printed on stdout and stderr."""
 
     def run_here(*arguments: object) -> tuple[str, str]:
         monkeypatch.setattr(sys, "argv", ["benchmark_costs.py", *map(str, arguments)])
         capfd.readouterr()
-        load("benchmark_costs").main()
+        load_benchmark("benchmark_costs").main()
         return capfd.readouterr()
 
     return run_here
@@ -44,8 +34,8 @@ def test_costs_by_stage(scene, tmp_path, run_benchmark):
     assert header.split() == list(row) and f"{row['pair_ms']:.2f}" in line.split()
 
 
-def test_costs_of_sift_and_of_what_is_not_installed(scene, load, monkeypatch):
-    costs = load("matching_costs")
+def test_costs_of_sift_and_of_what_is_not_installed(scene, load_benchmark, monkeypatch):
+    costs = load_benchmark("matching_costs")
     row = costs.measure_method("sift", scene.images, 3, None, ["images.long_edge_px=256"])
     assert row["pairs"] == 3 and row["matches"] > 20
     assert row["pair_ms"] > 0 and row["encode_ms"] > 0 and row["coarse_ms"] is None
@@ -69,8 +59,8 @@ def test_scaling_leaves_rows_and_a_curve(scene, tmp_path, run_benchmark):
     assert printed.split()[0] == "images"
 
 
-def test_scaling_doubles_the_images(scene, tmp_path, load, monkeypatch):
-    benchmark = load("benchmark_costs")
+def test_scaling_doubles_the_images(scene, tmp_path, load_benchmark, monkeypatch):
+    benchmark = load_benchmark("benchmark_costs")
     monkeypatch.setattr(benchmark, "write_crops", lambda *_: None)
     monkeypatch.setattr(benchmark, "draw_scaling", lambda *_: None)
     monkeypatch.setattr(benchmark, "measure_in_process", lambda job: {"photos": str(job["photos"])})
@@ -78,10 +68,10 @@ def test_scaling_doubles_the_images(scene, tmp_path, load, monkeypatch):
     assert [Path(row["photos"]).parent.name for row in rows] == [f"{n}_images" for n in (62, 125, 250, 500, 1000)]
 
 
-def test_crops_overlap_with_their_neighbours(scene, tmp_path, load):
+def test_crops_overlap_with_their_neighbours(scene, tmp_path, load_benchmark):
     from hm_sfm import HomoMatcher
 
-    load("matching_costs").write_crops(scene.images, tmp_path, 3)
+    load_benchmark("matching_costs").write_crops(scene.images, tmp_path, 3)
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["000000.jpg", "000001.jpg", "000002.jpg"]
     matches = HomoMatcher.from_pretrained("light").match(tmp_path / names[0], tmp_path / names[2])

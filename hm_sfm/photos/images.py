@@ -1,6 +1,6 @@
 """Stage 1: the photos of a folder, and one photo made ready for the network: grey, upright, reduced.
 
-Photos are read as COLMAP reads them, unrotated. Where EXIF says that a photo is turned it is turned for matching,
+Photos are read as COLMAP reads them, unrotated. Where EXIF says that a photo is rotated it is rotated for matching,
 and `PreparedImage.stored_from_scaled` maps the points back. HEIC, which COLMAP cannot read, is upright when decoded.
 """
 
@@ -185,7 +185,7 @@ def prepare_array(array: np.ndarray, long_edge_px: int, name: str = "array") -> 
 
 
 def read_rgb(image: PreparedImage) -> np.ndarray:
-    """(H, W, 3) uint8 RGB of a prepared image, turned and reduced as it is; grey where there is no file to read."""
+    """(H, W, 3) uint8 RGB of a prepared image, rotated and reduced as it is; grey where there is no file to read."""
     bitmap = read_bitmap(image.ref.path, as_rgb=True) if image.ref.path.is_file() else None
     if bitmap is None or (bitmap.width, bitmap.height) != tuple(image.ref.size_wh):
         return np.repeat(np.rint(image.grey * 255).astype(np.uint8)[:, :, None], 3, axis=2)

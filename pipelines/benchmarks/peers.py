@@ -120,8 +120,8 @@ class XfeatStar(Matcher):
         return self.xfeat.describe(photo), photo.stored_from_scaled
 
     def match_features(self, features0, features1) -> tuple[np.ndarray, np.ndarray]:
-        (found0, stored_from_scaled0), (found1, stored_from_scaled1) = features0, features1
-        xy0, xy1 = self.xfeat.match_points(found0, found1)
+        (description0, stored_from_scaled0), (description1, stored_from_scaled1) = features0, features1
+        xy0, xy1 = self.xfeat.match_points(description0, description1)
         return to_stored(xy0, stored_from_scaled0), to_stored(xy1, stored_from_scaled1)
 
 

@@ -484,7 +484,7 @@ def make_pair(
 @pytest.mark.parametrize("prior", [True, False], ids=["calibrated", "uncalibrated"])
 @pytest.mark.parametrize("shape", ["deep", "planar", "turning"])
 @pytest.mark.parametrize("num_matches", [200, 3000])
-def test_planted_outliers_are_found(num_matches, shape, prior):
+def test_planted_outliers_are_rejected(num_matches, shape, prior):
     # Exact where one geometry alone can fit. An essential matrix that only a plane determines is free to take in a few
     # wrong matches, and a fundamental matrix or a homography fits distorted images only roughly.
     tolerance = 0.0 if prior and shape == "deep" else 0.04

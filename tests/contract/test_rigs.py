@@ -140,7 +140,7 @@ def test_the_mapper_keeps_to_the_poses_of_the_rig(tmp_path, oracle, mapper, capf
 
 
 @pytest.mark.slow
-def test_poses_that_the_rig_lacks_are_found(tmp_path, oracle):
+def test_poses_that_the_rig_lacks_are_estimated(tmp_path, oracle):
     rig = write_rig(tmp_path, [{"cameras": [RIG[0]["cameras"][0], {"image_prefix": "right/"}]}])
     cameras = make_cameras(oracle.images, CameraConfig(params=PARAMS, rig=rig))
     assert lack_poses(cameras.rigs)
@@ -153,7 +153,7 @@ def test_poses_that_the_rig_lacks_are_found(tmp_path, oracle):
     assert {entry.name for entry in tmp_path.iterdir()} == {"database.db", "rig.json", "sparse"}
 
 
-def test_rigs_whose_poses_cannot_be_found_are_left_out(tmp_path, oracle, caplog):
+def test_rigs_whose_poses_cannot_be_estimated_are_left_out(tmp_path, oracle, caplog):
     rig = write_rig(tmp_path, [{"cameras": [RIG[0]["cameras"][0], {"image_prefix": "right/"}]}])
     cameras = make_cameras(oracle.images, CameraConfig(params=PARAMS, rig=rig))
     left = [some for some in oracle.matches if some.pair.name1.startswith("left/")]

@@ -104,7 +104,7 @@ def test_match_stops_after_the_matches(scene, tmp_path, run, read_matches):
 
 
 @pytest.mark.slow
-def test_match_pairs_by_their_looks(scene, tmp_path, run, read_matches, matched_pairs):
+def test_match_pairs_by_their_appearance(scene, tmp_path, run, read_matches, matched_pairs):
     command = ("match", scene.images, tmp_path / "out", "--pairs", "retrieval", "--set", "pairs.retrieval_top=1")
     finished = run(*command)
     assert finished.code == 0 and "retrieval: 100%" in finished.err

@@ -163,7 +163,7 @@ def test_shards_run_side_by_side_but_none_twice(tiny_photos, tmp_path, run):
     assert run("merge", tiny_photos, out).code == 0
 
 
-def test_shards_chosen_by_looks_encode_one_after_the_other(tiny_photos, tmp_path, run, monkeypatch):
+def test_shards_selected_by_appearance_encode_one_after_the_other(tiny_photos, tmp_path, run, monkeypatch):
     out = tmp_path / "out"
     (out / "retrieval").mkdir(parents=True)
     (out / ".hm_sfm").touch()

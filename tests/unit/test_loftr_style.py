@@ -106,7 +106,7 @@ def test_no_points_snap_to_nothing():
     assert xy.shape == (0, 2) and len(votes) == len(index) == 0
 
 
-def test_the_budget_goes_to_the_most_voted_and_keeps_their_order():
+def test_the_most_voted_points_are_selected_in_their_order():
     position = np.array([(0, 0), (1, 1), (2, 2), (3, 3)])
     xy, votes = keep_most_voted(position, np.array([1.0, 3.0, 1.0, 2.0]), 3)
     np.testing.assert_array_equal(xy, position[[0, 1, 3]])

@@ -145,7 +145,7 @@ def find_shown(camera: PinholeView) -> np.ndarray:
     return np.where(inverse_depth.any(axis=0), inverse_depth.argmax(axis=0), -1)
 
 
-def find_truth(pair, size_wh=SIZE_WH):
+def find_ground_truth(pair, size_wh=SIZE_WH):
     """Of the padded view A: mapped (H, W, 2) px of B, visible (H, W) bool, and calm (H, W): no edge in A or B near."""
     camera_a, camera_b = (reduce_camera(CAMERAS[i], size_wh) for i in pair)
     shown_a, shown_b = find_shown(camera_a), find_shown(camera_b)
@@ -181,14 +181,14 @@ def map_pixels(b_from_a, surface):
 
 
 def measure_errors(folders, pair, size_wh=SIZE_WH):
-    """(H, W) px, NaN without a surface; and the visible and calm of the ground truth."""
-    mapped, visible, calm = find_truth(pair, size_wh)
+    """(H, W) px, NaN without a surface; and the masks visible and calm of find_ground_truth."""
+    mapped, visible, calm = find_ground_truth(pair, size_wh)
     actual = map_pixels(*relate_depths(*read_views(folders, pair, size_wh), size_wh))
     return np.linalg.norm(actual - mapped, axis=-1), visible, calm
 
 
 @pytest.mark.parametrize("pair", ALL_PAIRS)
-def test_blocks_carry_points_as_the_scene_does(folders, pair):
+def test_blocks_transfer_points_as_the_scene_does(folders, pair):
     errors, visible, calm = measure_errors(folders, pair)
     related = np.isfinite(errors)
     assert (visible & calm).sum() > 2000
@@ -321,7 +321,7 @@ def test_items_depend_on_seed_and_index_alone(folders):
 def test_patches_are_supervised_by_the_blocks(folders):
     size_wh = (160, 160)
     b_from_a, surface = relate_depths(*read_views(folders, (0, 1), size_wh), size_wh)
-    mapped, _, calm = find_truth((0, 1), size_wh)
+    mapped, _, calm = find_ground_truth((0, 1), size_wh)
     fine = LightBackbone.fine_grid
     supervision = draw_patches(
         torch.tensor(b_from_a)[None],

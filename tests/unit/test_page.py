@@ -125,7 +125,7 @@ def test_a_page_refers_to_nothing_outside():
     assert "default-src 'none'" in page
 
 
-def test_nothing_was_found():
+def test_without_a_model_the_page_says_so():
     """No model, no verified pair, no tracks."""
     report = make_report()
     images = [dataclasses.replace(image, registered=False, mean_error_px=None) for image in report.images]

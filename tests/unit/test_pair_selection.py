@@ -100,7 +100,7 @@ def test_auto_beyond_takes_what_looks_alike_and_the_window_of_a_sequence():
     assert set(pairs) == on_circle(in_order(200), 2) | within
 
 
-def test_numbers_that_say_nothing_about_the_looks_make_no_sequence():
+def test_numbers_that_say_nothing_about_the_appearance_make_no_sequence():
     shuffled = in_order(200)
     np.random.default_rng(0).shuffle(shuffled)
     pairs = select_pairs(numbered(200), PairConfig(window=5, retrieval_top=4), PlantedAppearance(shuffled))

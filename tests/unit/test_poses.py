@@ -113,7 +113,7 @@ def test_empty_model_scores_zero():
     assert np.isinf(score.median_rotation_deg)
 
 
-def test_truth_of_other_images_or_of_one_image_is_refused():
+def test_ground_truth_of_other_images_or_of_one_image_is_refused():
     ground_truth = make_ground_truth(3)
     with pytest.raises(InputError, match="'0.jpg'.*'elsewhere/0.jpg'"):
         measure_pose_errors(

@@ -69,7 +69,7 @@ def ring(monkeypatch) -> Ring:
     return Ring(60)
 
 
-def test_photos_of_the_same_part_are_found(ring, tmp_path):
+def test_photos_of_the_same_part_are_similar(ring, tmp_path):
     similar = find_similar(ring.describe(tmp_path), 8)
     steps = (similar - np.arange(60)[:, None] + 30) % 60 - 30
     # 15 photos farther on, nothing is in common.
@@ -213,7 +213,7 @@ def test_flat_photos_resemble_each_other_and_no_others(ring, tmp_path):
     assert find_similar(descriptors, 2)[:3].tolist() == [[1, 2], [0, 2], [0, 1]]
 
 
-def test_turned_photos_are_found(tmp_path):
+def test_rotated_photos_are_similar(tmp_path):
     """Textures, each seen twice: as it is, and turned."""
     matcher = HomoMatcher.from_pretrained("light")
     rng = np.random.default_rng(0)

@@ -47,7 +47,7 @@ def draw(b_from_a: np.ndarray, seed: int = 0, per_pair: int = 400) -> PatchSuper
     return draw_patches(matrix, surface, per_pair, COARSE, FINE, HALF, torch.Generator().manual_seed(seed))
 
 
-def test_patches_hold_the_truth():
+def test_patches_hold_the_ground_truth():
     b_from_a = np.array([[[1.1, -0.1, 9.0], [0.12, 0.95, -14.0], [1e-4, 2e-4, 1.0]], np.eye(3)])
     supervision = draw(b_from_a)
     assert 400 < len(supervision.cell0) <= 800
@@ -105,7 +105,7 @@ def make_estimate(displacement: torch.Tensor, log_scale: float = 0.0) -> FineEst
     )
 
 
-def test_the_truth_has_no_error():
+def test_the_ground_truth_has_no_error():
     supervision = make_supervision()
     estimate = make_estimate(supervision.displacement)
     assert measure_errors(estimate, supervision).shape == (6, 81)

@@ -136,7 +136,7 @@ def test_retrieval_that_finds_nothing_is_told():
         select_pairs(["a", "b", "c"], PairConfig(mode="retrieval"), lambda names, top, gap: np.full((3, 2), -1))
 
 
-def test_a_sequence_closes_its_loops_by_looks():
+def test_a_sequence_closes_its_loops_by_appearance():
     appearance = PlantedAppearance()
     pairs = select_pairs(numbered(100), PairConfig(mode="sequential", window=3, loop_top=2), appearance)
     assert appearance.asked == [(2, 12)]

@@ -62,7 +62,7 @@ def _walk_greedily(pairs: Sequence[ImagePair], capacity: int) -> list[int]:
     cached: OrderedDict[int, None] = OrderedDict()  # used longest ago first
     order: list[int] = []
 
-    def add_links(image: int, step: int) -> None:
+    def count_partners(image: int, step: int) -> None:
         row = slice(first[image], first[image + 1])
         needed[partner[row][is_open[position[row]]]] += step
 
@@ -82,17 +82,17 @@ def _walk_greedily(pairs: Sequence[ImagePair], capacity: int) -> list[int]:
         needed[image] = 0
         cached[image] = None
         is_cached[image] = True
-        add_links(image, 1)
+        count_partners(image, 1)
         if len(order) == len(pairs):
             return order
 
         if len(cached) == capacity:
             given_up, next_oldest = islice(cached, 2)
-            add_links(given_up, -1)
+            count_partners(given_up, -1)
             if not needed.any():  # The next pair is one of the oldest image, which that keeps in the cache.
-                add_links(given_up, 1)
+                count_partners(given_up, 1)
                 given_up = next_oldest
-                add_links(given_up, -1)
+                count_partners(given_up, -1)
             del cached[given_up]
             is_cached[given_up] = False
         if needed.any():

@@ -53,7 +53,8 @@ def reconstruct_folder(photos: Path, out: Path) -> None:
     database = out / "database.db"
     write_database(database, images, cameras, keypoints, matches)
     verify_database(database, config.verification, max(px_scale.values()))
-    models = map_incrementally(MappingTask(database, photos, out / "sparse", config.mapping))
+    task = MappingTask(database, photos, out / "sparse", config.mapping, config.verification.max_error_px)
+    models = map_incrementally(task)
 
     result = summarise_models(models, len(images))
     print(f"{result.registered} of {result.num_images} images registered, {result.points} points")

@@ -24,9 +24,10 @@ class NetworkConfig:
 
     backbone: Literal["light", "loftr"] = "light"
     """Where the features come from: `light` (XFeat's trunk with a fine branch) or `loftr` (LoFTR's ResNet)."""
-    coarse: Literal["attention", "aspan", "cosine"] = "cosine"
-    """`attention` (LoFTR's transformer and dual softmax), `aspan` (ASpanFormer's, which attends around a flow) or
-    `cosine` (mutual nearest neighbours of plain features)."""
+    coarse: Literal["context", "cosine", "attention", "aspan"] = "context"
+    """`context` (keypoints matched by LightGlue, each seeing its surroundings and the other image), `cosine` (mutual
+    nearest neighbours of plain cells), `attention` (LoFTR's transformer and dual softmax) or `aspan` (ASpanFormer's,
+    which attends around a flow)."""
     head: Literal["homography", "expectation"] = "homography"
     """`homography` (the paper) or `expectation` (LoFTR's point-to-patch baseline)."""
     window: int = 9
@@ -89,6 +90,8 @@ class MatchingConfig:
     """A file with coarse matches of any other matcher instead, in the format of hloc or of its match_dense."""
     coarse_features: str = ""
     """A file with the keypoints, in hloc's format, if coarse_matches holds indices of keypoints."""
+    context_keypoints: int = 2048
+    """network.coarse context: keypoints per image that the coarse stage matches."""
     min_cosine: float = 0.8
     """Least cosine similarity of a coarse match where cells are matched by plain features (network.coarse cosine)."""
     min_confidence: float = 0.2
@@ -96,9 +99,8 @@ class MatchingConfig:
     max_matches: int = 8000
     """The matches with the best scores that are kept per pair."""
     grow_below: int = 300
-    """In pairs with fewer good matches than this, these grow to neighbours that the coarse stage missed; 0, as in the
-    paper, grows none. Pairs with enough gain nothing, because grown matches are less exact than those of the coarse
-    stage."""
+    """In pairs with fewer good matches than this, these grow to neighbours that the coarse stage missed. Matches of
+    keypoints (network.coarse context) are sparse and always grow. 0, as in the paper, grows none."""
     try_hypotheses: bool = True
     """Pairs with few good matches are tried with one photo rotated by quarter turns and reduced to 1/2 and 1/3, and are
     matched again where that fits clearly better."""
@@ -133,16 +135,16 @@ class VerificationConfig:
 class KeypointConfig:
     """Persistent keypoints. Distances are px of the matching resolution; they are scaled to each photo."""
 
-    propagation_min_score: float = 0.7
+    propagation_min_score: float = 0.8
     """Patches with a lower score propagate no keypoints, except for the best patches of pairs that have few. hm-sfm
     refine ignores this setting, because it starts from verified matches."""
     propagation_radius_px: float = 8.0
     """A patch propagates keypoints up to this distance from its centre."""
     join_radius_px: float = 1.0
     """A propagated keypoint joins an existing one up to this distance from it ..."""
-    separation_px: float = 2.0
+    separation_px: float = 1.6
     """... and becomes a new one only if all others are farther away than this."""
-    seed_spacing_px: float = 3.0
+    seed_spacing_px: float = 2.0
     """A patch seeds a keypoint if there is none up to this distance."""
     adjustment_rounds: int = 15
     """Rounds of the joint adjustment of each track's keypoints; 0 leaves them where they were first predicted."""

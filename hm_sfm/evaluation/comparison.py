@@ -29,6 +29,7 @@ from hm_sfm.io.locks import release_locks
 from hm_sfm.matching.interfaces import PairMatcher
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.store import MatchStore, digest_image
+from hm_sfm.network.checkpoints import find_weights
 from hm_sfm.pipeline.collection import collect_photos, measure_px_scales
 from hm_sfm.pipeline.output_folder import MATCHES_FILE, claim_folder, describe_matching
 from hm_sfm.pipeline.reconstruction import build_model
@@ -126,21 +127,25 @@ def read_ground_truth(folder: Path, names: Sequence[str]) -> dict[str, PinholeVi
 def load_expectation(model: str, config: Config) -> tuple[HomoMatcher, dict[str, object]]:
     """The matcher of the expectation head, and what its matches depend on.
 
-    Raises WeightsError where the weights are unusable, ConfigError where they are of another head, or of other
-    features than those of the configuration.
+    Where the configuration's network has context, its coarse matches are taken: the heads share them. Raises
+    WeightsError where the weights are unusable, ConfigError where they are of another head, or of other features than
+    those of the configuration.
     """
-    matcher = HomoMatcher.from_pretrained(model, config=config.matching, images=config.images)
+    matching = dataclasses.replace(config.matching, model=model)
+    shares_context = config.network.coarse == "context" and matching.coarse == "light" and not matching.coarse_matches
+    if shares_context:
+        matching = dataclasses.replace(matching, coarse=str(find_weights(config.matching.model)))
+    matcher = HomoMatcher.from_pretrained(model, config=matching, images=config.images)
     network = matcher.net.config
     if network.head != "expectation":
         raise ConfigError(f"model {model!r} has the head {network.head!r}: LoFTR-style matches need 'expectation'")
     for field in dataclasses.fields(network):
         actual, expected = getattr(network, field.name), getattr(config.network, field.name)
-        if field.name not in HEAD_FIELDS and actual != expected:
+        if field.name not in HEAD_FIELDS and actual != expected and not (field.name == "coarse" and shares_context):
             raise ConfigError(
                 f"model {model!r} has network.{field.name} {actual!r}, the configuration {expected!r}: the methods "
                 "must share their features"
             )
-    matching = dataclasses.replace(config.matching, model=model)
     return matcher, describe_matching(dataclasses.replace(config, network=network, matching=matching))
 
 

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 
 from hm_sfm.matching.encoder import Encoder
-from hm_sfm.matching.patches import estimate_patches, locate_patches, make_start, round_to_cells
+from hm_sfm.matching.patches import locate_patches, make_start, round_to_cells
 from hm_sfm.network.device import computes_in_half
+from hm_sfm.network.estimates import estimate_patches
 from hm_sfm.network.fine import FineMap
 from hm_sfm.photos.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
 from hm_sfm.photos.images import prepare_image
@@ -94,7 +95,7 @@ class PatchRefiner:
         cell1, offset1 = round_to_cells(xy1, grid)
         start = make_start(offset0, offset1, relate_inputs(features0, features1, placement), head.half).to(device)
         estimates = estimate_patches(
-            head, features0.fine, features1.fine, cell0.to(device), cell1.to(device), start, ITERATIONS
+            head, features0.fine, features1.fine, cell0.to(device), cell1.to(device), start, iterations=ITERATIONS
         )
         patches = locate_patches(
             estimates, offset0, features0.stored_from_scaled, features1.stored_from_scaled, grid, head.half

@@ -36,4 +36,4 @@ class CoarseCells:
 
 def choose_threshold(net: HomoNet, config: MatchingConfig) -> float:
     """The least score of a coarse match: a cosine or a confidence, whichever the network's coarse stage gives."""
-    return config.min_cosine if net.config.coarse == "cosine" else config.min_confidence
+    return config.min_cosine if net.config.coarse in ("cosine", "context") else config.min_confidence

@@ -5,8 +5,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from hm_sfm.matching.interfaces import ImageFeatures
+from hm_sfm.matching.interfaces import ImageFeatures, ImageKeypoints
 from hm_sfm.network.backbone import FeatureMaps, require_fine
+from hm_sfm.network.detector import describe_keypoints, detect_keypoints
 from hm_sfm.network.device import autocast
 from hm_sfm.network.fine import FineMap, make_fine_map
 from hm_sfm.network.homonet import HomoNet
@@ -21,8 +22,9 @@ MARGIN_PX = 128
 class Encoder:
     """A network on a device, ready to encode images. The network is moved there and frozen."""
 
-    def __init__(self, net: HomoNet, device: torch.device) -> None:
-        self.device = device
+    def __init__(self, net: HomoNet, device: torch.device, max_keypoints: int = 2048) -> None:
+        """max_keypoints: that are matched in context, see MatchingConfig."""
+        self.device, self.max_keypoints = device, max_keypoints
         self.net = net.to(device).eval().requires_grad_(False)
         # Half the time on a CPU. PyTorch's own type hints lack this argument of a module.
         self.net.backbone.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
@@ -30,7 +32,8 @@ class Encoder:
     @torch.inference_mode()
     def encode(self, image: PreparedImage) -> ImageFeatures:
         """All features of an image, described by no provider yet."""
-        maps = self._run_backbone(self._pad(image))
+        pixels = self._pad(image)
+        maps = self._run_backbone(pixels)
         coarse = self._describe_cells(maps.coarse, image)
         rows, columns = coarse.shape[:2]
         y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
@@ -41,6 +44,7 @@ class Encoder:
             scaled_wh=image.scaled_wh,
             stored_from_scaled=image.stored_from_scaled,
             image=image.ref,
+            keypoints=self._find_keypoints(pixels, maps.coarse, image) if self.net.config.coarse == "context" else None,
         )
 
     @torch.inference_mode()
@@ -75,6 +79,19 @@ class Encoder:
     def _run_backbone(self, pixels: Tensor, want_fine: bool = True) -> FeatureMaps:
         with autocast(self.device):
             return self.net.backbone(pixels, want_fine)
+
+    @torch.inference_mode()
+    def encode_keypoints(self, image: PreparedImage) -> ImageKeypoints:
+        """The keypoints alone, of a network that matches them in context."""
+        pixels = self._pad(image)
+        return self._find_keypoints(pixels, self._run_backbone(pixels, want_fine=False).coarse, image)
+
+    def _find_keypoints(self, pixels: Tensor, coarse: Tensor, image: PreparedImage) -> ImageKeypoints:
+        """pixels, coarse: what the backbone is given, and its map at 1/8."""
+        probability, reliability = self.net.detector(pixels, coarse.float())
+        xy, _ = detect_keypoints(probability, reliability, image.scaled_wh, self.max_keypoints)
+        descriptors = describe_keypoints(coarse[0], xy)
+        return ImageKeypoints(xy, self.net.context.describe(descriptors, xy, image.scaled_wh))
 
     def _describe_cells(self, coarse: Tensor, image: PreparedImage) -> Tensor:
         """The backbone's (1, C, H', W') -> (H, W, C) of the cells within the image, as the coarse stage sees them."""

@@ -1,7 +1,7 @@
 """What the parts of matching hand to each other, and what they ask of each other."""
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hm_sfm.config import ImageConfig, MatchingConfig
 from hm_sfm.network.fine import FineMap
+from hm_sfm.network.lightglue import KeypointStates
 from hm_sfm.photos.images import PreparedImage
 from hm_sfm.types import ImageRef, PatchMatches, freeze_array
 
@@ -26,8 +27,11 @@ class PointPairs:
     linear: np.ndarray | None = None
     """(M, 2, 2) float64: px of image 1 per px of image 0 around each match, from its relative scale and rotation; None
     where the provider does not know them."""
-    index0: np.ndarray | None = None
-    """(M,) int64: the cells of image 0's coarse grid that the points are, for matches that can grow on it."""
+    place: np.ndarray | None = None
+    """(M,) float32 in [0, 1]: the probability that the two points are at the same place; None where the provider does
+    not know it."""
+    grow: Literal["never", "if few", "always"] = "never"
+    """Whether matches grow beside these: "if few" are good, see MatchingConfig.grow_below."""
 
     def __post_init__(self) -> None:
         count = len(self.score)
@@ -36,8 +40,8 @@ class PointPairs:
         object.__setattr__(self, "score", freeze_array(self.score, np.float32, (count,), "score"))
         if self.linear is not None:
             object.__setattr__(self, "linear", freeze_array(self.linear, np.float64, (count, 2, 2), "linear"))
-        if self.index0 is not None:
-            object.__setattr__(self, "index0", freeze_array(self.index0, np.int64, (count,), "index0"))
+        if self.place is not None:
+            object.__setattr__(self, "place", freeze_array(self.place, np.float32, (count,), "place"))
 
     def __len__(self) -> int:
         return len(self.score)
@@ -45,8 +49,22 @@ class PointPairs:
     def keep_best(self, most: int) -> "PointPairs":
         """The `most` matches of the highest score, best first; of equal ones the first."""
         best = np.argsort(-self.score, kind="stable")[:most]
-        linear, index0 = (None if field is None else field[best] for field in (self.linear, self.index0))
-        return PointPairs(self.xy0[best], self.xy1[best], self.score[best], linear, index0)
+        linear, place = (None if values is None else values[best] for values in (self.linear, self.place))
+        return PointPairs(self.xy0[best], self.xy1[best], self.score[best], linear, place, self.grow)
+
+
+@dataclass(frozen=True)
+class ImageKeypoints:
+    """What the context stage matches: the K keypoints of an image, best first, K = 0 in an image without texture."""
+
+    xy: Tensor
+    """(K, 2) float32 px of the network's input, COLMAP's frame."""
+    states: KeypointStates
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that they take."""
+        return sum(tensor.nbytes for tensor in (self.xy, self.states.state, self.states.cos, self.states.sin))
 
 
 @dataclass(frozen=True)
@@ -62,6 +80,8 @@ class ImageFeatures:
     stored_from_scaled: np.ndarray
     """(3, 3) float64: px of the network's input -> px of the stored image."""
     image: ImageRef
+    keypoints: ImageKeypoints | None = None
+    """Where the network matches keypoints in context."""
     description: dict[str, Any] = field(default_factory=dict)
     """What the provider of coarse matches keeps of the image, see CoarseProvider.describe."""
 
@@ -69,7 +89,8 @@ class ImageFeatures:
     def size_bytes(self) -> int:
         """Memory that the features take."""
         described = [value for value in self.description.values() if hasattr(value, "nbytes")]
-        return sum(array.nbytes for array in (self.coarse, self.cell, self.fine.cells, *described))
+        keypoints = self.keypoints.nbytes if self.keypoints else 0
+        return keypoints + sum(array.nbytes for array in (self.coarse, self.cell, self.fine.cells, *described))
 
 
 class CoarseProvider(Protocol):

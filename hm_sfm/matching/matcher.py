@@ -10,23 +10,24 @@ from torch import Tensor
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig
 from hm_sfm.matching.cells import CoarseCells
 from hm_sfm.matching.encoder import Encoder
+from hm_sfm.matching.epipolar import agree_with, fit_fundamental
 from hm_sfm.matching.hypotheses import Sketch, retry_hypotheses
-from hm_sfm.matching.interfaces import CellMatcher, CoarseProvider, ImageFeatures
+from hm_sfm.matching.interfaces import CellMatcher, CoarseProvider, ImageFeatures, PointPairs
 from hm_sfm.matching.patches import (
-    PatchEstimates,
-    estimate_patches,
     fine_cell_of,
     is_inside,
+    locate_matches,
     locate_patches,
     make_start,
     round_to_cells,
-    scale_from_score,
 )
 from hm_sfm.matching.providers.choice import make_provider
 from hm_sfm.network.checkpoints import load_weights
 from hm_sfm.network.device import pick_device
+from hm_sfm.network.estimates import PatchEstimates, estimate_patches
 from hm_sfm.network.fine import HomographyHead
-from hm_sfm.network.growth import GridMatches, PatchGrid, grow_matches
+from hm_sfm.network.growth import PatchGrid, grow_matches
+from hm_sfm.network.homography import is_regular
 from hm_sfm.network.homonet import HomoNet
 from hm_sfm.photos.hypotheses import apply_hypothesis
 from hm_sfm.photos.images import PreparedImage, prepare_array, prepare_image, read_ref
@@ -34,7 +35,7 @@ from hm_sfm.types import PatchMatches
 
 GROWING_SCORE = 0.5
 """Matches at least as good as this spread to their neighbours."""
-GROWING_ROUNDS = 8
+GROWING_ROUNDS = 12
 """How many cells far they spread."""
 
 
@@ -55,7 +56,7 @@ class HomoMatcher:
 
         Raises ConfigError where the device is unknown or absent, and what make_provider raises.
         """
-        encoder = Encoder(net, pick_device(config.device))
+        encoder = Encoder(net, pick_device(config.device), config.context_keypoints)
         return cls(encoder, config, images, make_provider(config, encoder))
 
     @classmethod
@@ -106,14 +107,11 @@ class HomoMatcher:
         start = None
         if isinstance(head, HomographyHead) and (points.linear is not None or offset0.any() or offset1.any()):
             start = make_start(offset0, offset1, points.linear, head.half).to(self.device)
+        place = None if points.place is None else torch.tensor(points.place, device=self.device)
         patches = estimate_patches(
-            head, features0.fine, features1.fine, cell0.to(self.device), cell1.to(self.device), start
+            head, features0.fine, features1.fine, cell0.to(self.device), cell1.to(self.device), start, place
         )
-        good = scale_from_score(GROWING_SCORE, grid)
-        index0 = points.index0 if isinstance(head, HomographyHead) else None
-        if index0 is not None and torch.count_nonzero(patches.log_scale < good) < self.config.grow_below:
-            patches = self._grow(features0, features1, index0, patches, good)
-            offset0 = np.zeros((len(patches.cell0), 2))
+        patches, offset0 = self._grow(features0, features1, points, patches, offset0)
         stored = locate_patches(
             patches, offset0, features0.stored_from_scaled, features1.stored_from_scaled, grid, head.half
         )
@@ -131,29 +129,52 @@ class HomoMatcher:
             patch_radius_px=stored.patch_radius_px,
         )
 
+    def _lay_grid(self, size_wh: tuple[int, int], is_chessboard: bool) -> PatchGrid:
+        """The patches of an image of size_wh px (the network's input) that matches grow into."""
+        backbone = self.net.backbone
+        columns, rows = (backbone.coarse_grid.count_cells(size) for size in size_wh)
+        first, second = fine_cell_of(torch.tensor([[0, 0], [1, 1]]), backbone.coarse_grid, backbone.fine_grid)
+        return PatchGrid(columns, rows, int(first[0]), int(second[0] - first[0]), self.net.head.half, is_chessboard)
+
     def _grow(
         self,
         features0: ImageFeatures,
         features1: ImageFeatures,
-        index0: np.ndarray,
+        points: PointPairs,
         patches: PatchEstimates,
-        good: float,
-    ) -> PatchEstimates:
-        """The patches, and those that grow beside the good ones (log_scale below `good`).
+        offset0: np.ndarray,
+    ) -> tuple[PatchEstimates, np.ndarray]:
+        """The patches, and those that grow beside the good ones, where the provider wants that.
 
-        index0: (P,) int64, the cells of image 0's coarse grid that the patches are of.
+        offset0: (P, 2) cells, the points of image 0 relative to the centres of their patches; also returned. Where the
+        good matches have a two-view geometry, only matches that agree with it grow, and only into such.
         """
-        coarse_grid, fine_grid = self.net.backbone.coarse_grid, self.net.backbone.fine_grid
-        columns, rows = (coarse_grid.count_cells(size) for size in features0.scaled_wh)
-        first, second = fine_cell_of(torch.tensor([[0, 0], [1, 1]]), coarse_grid, fine_grid)
-        grid = PatchGrid(columns, rows, int(first[0]), int(second[0] - first[0]), self.net.head.half)
-        matches = GridMatches(
-            torch.tensor(index0, device=self.device), patches.cell1, patches.homography, patches.log_scale
-        )
+        head = self.net.head
+        few = torch.count_nonzero(patches.score >= GROWING_SCORE) < self.config.grow_below
+        wanted = (points.grow == "always" and self.config.grow_below > 0) or (points.grow == "if few" and few)
+        if not wanted or not isinstance(head, HomographyHead) or not len(points):
+            return patches, offset0
+        grid = self._lay_grid(features0.scaled_wh, is_chessboard=points.grow == "always")
+        fundamental = None
+        if points.place is not None:
+            good = (is_regular(patches.homography, head.half) & (patches.score >= GROWING_SCORE)).cpu().numpy()
+            xy0, xy1 = locate_matches(patches, offset0, self.net.backbone.fine_grid)
+            fundamental = fit_fundamental(xy0[good], xy1[good], points.place[good])
 
-        def estimate(cell0: Tensor, cell1: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
-            beside = estimate_patches(self.net.head, features0.fine, features1.fine, cell0, cell1, start)
-            return beside.homography, beside.log_scale
+        def doubt(estimates: PatchEstimates, offset0: np.ndarray | float = 0.0) -> PatchEstimates:
+            """Without accuracy where the pair's geometry denies them."""
+            if fundamental is None:
+                return estimates
+            agreeing = agree_with(fundamental, *locate_matches(estimates, offset0, self.net.backbone.fine_grid))
+            accuracy = estimates.accuracy * torch.tensor(agreeing, device=self.device)
+            return dataclasses.replace(estimates, accuracy=accuracy)
 
-        grown = grow_matches(matches, grid, estimate, features1.fine.size_wh, good, GROWING_ROUNDS)
-        return PatchEstimates(grid.to_fine(grown.index0), grown.cell1, grown.homography, grown.log_scale)
+        def refine(cell0: Tensor, cell1: Tensor, start: Tensor, place: Tensor) -> PatchEstimates:
+            return doubt(estimate_patches(head, features0.fine, features1.fine, cell0, cell1, start, place))
+
+        seeds = doubt(patches, offset0)
+        grown = grow_matches(seeds, grid, refine, features1.fine.size_wh, GROWING_SCORE, GROWING_ROUNDS)
+        beside = ~grid.holds(patches.cell0)
+        patches = PatchEstimates.concatenate([patches.select(beside), grown])
+        kept = offset0[beside.cpu().numpy()]
+        return patches, np.concatenate([kept, np.zeros((len(patches.cell0) - len(kept), 2))])

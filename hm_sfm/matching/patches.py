@@ -3,39 +3,15 @@
 Patch coordinates are cells of the fine grid relative to the centre of the patch, see hm_sfm.network.homography.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from hm_sfm.geometry.frames import Grid
-from hm_sfm.network.device import autocast
-from hm_sfm.network.fine import ExpectationHead, FineMap, HomographyHead
-from hm_sfm.network.homography import is_regular, make_corners
-
-FINE_CHUNK = 512
-"""Patches per call of the fine head: bounds its memory to about 50 MB."""
-FINE_STEP = 64
-"""Smaller calls are filled up to a multiple of this: PyTorch keeps memory for every size it was ever called with."""
-
-Head = HomographyHead | ExpectationHead
-
-
-@dataclass(frozen=True)
-class PatchEstimates:
-    """What the fine head says of P patches around pairs of fine cells; tensors on its device."""
-
-    cell0: Tensor
-    """(P, 2) int64: the cells of image 0 that the patches are cut around."""
-    cell1: Tensor
-    """(P, 2) int64: those of image 1."""
-    homography: Tensor
-    """(P, 3, 3) float32: patch of image 0 -> patch of image 1."""
-    log_scale: Tensor
-    """(P,) float32: log of the expected error (Laplace scale), cells."""
+from hm_sfm.network.estimates import PatchEstimates
+from hm_sfm.network.homography import apply_homography, is_regular, make_corners
 
 
 @dataclass(frozen=True)
@@ -49,40 +25,11 @@ class StoredPatches:
     homography: np.ndarray
     """(P, 3, 3): image 0 -> image 1, the denominator 1 at xy0; the identity, and xy1 of no use, where not regular."""
     score: np.ndarray
-    """(P,) in [0, 1], see score_from_scale."""
+    """(P,) in [0, 1], see PatchEstimates."""
     regular: np.ndarray
     """(P,) bool, see is_regular."""
     patch_radius_px: float
     """Half a patch of image 0."""
-
-
-def estimate_patches(
-    head: Head,
-    fine0: FineMap,
-    fine1: FineMap,
-    cell0: Tensor,
-    cell1: Tensor,
-    start: Tensor | None = None,
-    iterations: int | None = None,
-) -> PatchEstimates:
-    """The head's last estimate of P patches, computed some at a time.
-
-    cell0, cell1: (P, 2) int64 fine cells; start: (P, 4, 2) cells and iterations, as in HomographyHead.forward.
-    """
-    device = fine0.cells.device
-    homography, log_scale = [torch.zeros(0, 3, 3, device=device)], [torch.zeros(0, device=device)]
-    for first in range(0, len(cell0), FINE_CHUNK):
-        chunk = slice(first, first + FINE_CHUNK)
-        count = len(cell0[chunk])
-        padding = (0, 0, 0, -count % FINE_STEP)
-        image = torch.zeros(count + padding[-1], dtype=torch.int64, device=device)
-        cells = (F.pad(cell[chunk], padding) for cell in (cell0, cell1))
-        begin = {} if start is None else {"start": F.pad(start[chunk], (0, 0, *padding)), "iterations": iterations}
-        with autocast(device):
-            estimate = head(fine0, fine1, image, *cells, **begin)[-1]
-        homography.append(estimate.homography[:count])
-        log_scale.append(estimate.log_scale[:count])
-    return PatchEstimates(cell0, cell1, torch.cat(homography), torch.cat(log_scale))
 
 
 def locate_patches(
@@ -110,10 +57,21 @@ def locate_patches(
         xy0=xy0,
         xy1=mapped[:, :2] / mapped[:, 2:],
         homography=homography / mapped[:, 2, None, None],
-        score=score_from_scale(patches.log_scale.cpu().numpy().astype(np.float64), grid),
+        score=patches.score.cpu().numpy().astype(np.float64),
         regular=regular,
         patch_radius_px=float(half * px_per_cell),
     )
+
+
+def locate_matches(patches: PatchEstimates, offset0: np.ndarray | float, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """(P, 2) float64 px of the network's inputs: points of image 0, and where the patches put them in image 1.
+
+    offset0: (P, 2) cells, the points relative to the centres of their patches. grid: of the fine cells.
+    """
+    at = torch.as_tensor(offset0, dtype=torch.float64).expand(len(patches.cell0), 2)
+    moved = apply_homography(patches.homography.double().cpu(), at[:, None])[:, 0]
+    xy0, xy1 = (cell.cpu() + offset for cell, offset in ((patches.cell0, at), (patches.cell1, moved)))
+    return grid.to_px(xy0).numpy(), grid.to_px(xy1).numpy()
 
 
 def fine_cell_of(coarse_cell: Tensor, coarse_grid: Grid, fine_grid: Grid) -> Tensor:
@@ -154,16 +112,3 @@ def is_inside(xy: np.ndarray, scaled_wh: tuple[int, int], stored_from_scaled: np
     width, height = scaled_wh
     corners = stored_from_scaled[:2] @ np.array([[0, width], [0, height], [1, 1]])
     return np.all((xy >= corners.min(axis=1)) & (xy < corners.max(axis=1)), axis=1)
-
-
-def score_from_scale(log_scale: np.ndarray, grid: Grid) -> np.ndarray:
-    """Error scale (P,), log cells -> (P,) in [0, 1]: the probability that a match is off by less than 1 px (Laplace).
-
-    The px are those of the network's input.
-    """
-    return 1 - np.exp(-1 / (np.exp(log_scale) * grid.stride))
-
-
-def scale_from_score(score: float, grid: Grid) -> float:
-    """The inverse of score_from_scale."""
-    return -math.log(-math.log(1 - score) * grid.stride)

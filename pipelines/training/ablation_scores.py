@@ -19,9 +19,9 @@ from hm_sfm.io.atomic import replace_file, write_json
 from hm_sfm.matching.cells import choose_threshold
 from hm_sfm.matching.encoder import pad_image
 from hm_sfm.matching.matcher import HomoMatcher
-from hm_sfm.matching.patches import FINE_CHUNK
 from hm_sfm.network.checkpoints import read_checkpoint
 from hm_sfm.network.device import autocast
+from hm_sfm.network.estimates import FINE_CHUNK
 from hm_sfm.network.fine import make_fine_map
 from hm_sfm.network.homonet import HomoNet
 from hm_sfm.photos.images import prepare_image, read_ref

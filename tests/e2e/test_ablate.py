@@ -93,5 +93,5 @@ def test_ablate_refuses_weights_without_a_transformer(ablate, tmp_path, capfd):
     with pytest.raises(SystemExit) as stop:
         ablate("--attention-weights", "light")
     assert stop.value.code == 2
-    assert "light has no coarse transformer: network.coarse is 'cosine'" in capfd.readouterr().err
+    assert "light has no coarse transformer: network.coarse is 'context'" in capfd.readouterr().err
     assert not (tmp_path / "versions").exists()

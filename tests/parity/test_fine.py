@@ -6,8 +6,8 @@ import torch
 import torch.nn.functional as F
 
 from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig
-from hm_sfm.matching import patches
 from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.network import estimates
 from hm_sfm.network.coarse import match_by_similarity
 from hm_sfm.network.fine import (
     ExpectationHead,
@@ -203,14 +203,14 @@ def test_heads_take_no_patches(head):
 def test_patches_in_chunks_equal_patches_at_once(monkeypatch):
     monkeypatch.setattr("hm_sfm.network.device.computes_in_half", lambda device: False)
     torch.manual_seed(0)
-    net = HomoNet(NetworkConfig())
+    net = HomoNet(NetworkConfig(coarse="cosine"))
     for layer in (net.head.corners, net.head.scale):
         torch.nn.init.normal_(layer.weight, std=0.1)
     matcher = HomoMatcher.from_network(net, MatchingConfig(device="cpu", min_cosine=0.0), ImageConfig())
     pixels = np.random.default_rng(0).integers(0, 256, (96, 128), dtype=np.uint8)
     features0, features1 = (matcher.encode(prepare_array(image, 128)) for image in (pixels, pixels[::-1]))
     whole = matcher.match_features(features0, features1)
-    monkeypatch.setattr(patches, "FINE_CHUNK", 7)
+    monkeypatch.setattr(estimates, "FINE_CHUNK", 7)
     pieces = matcher.match_features(features0, features1)
     assert len(whole) > 14
     order, piece_order = (np.lexsort(found.xy0.T) for found in (whole, pieces))

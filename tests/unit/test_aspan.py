@@ -385,7 +385,7 @@ def test_the_loop_trains_it_by_matches_and_flow(training, stage):
 
 
 def test_unknown_coarse_stages_are_refused_and_the_known_ones_named():
-    with pytest.raises(ConfigError, match="network.coarse must be attention, aspan or cosine, found 'span'"):
+    with pytest.raises(ConfigError, match="network.coarse must be context, cosine, attention or aspan, found 'span'"):
         HomoNet(NetworkConfig(coarse="span"))
 
 

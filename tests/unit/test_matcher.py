@@ -15,6 +15,9 @@ from hm_sfm.network.checkpoints import load_weights
 from hm_sfm.network.homonet import HomoNet
 from hm_sfm.types import PatchMatches
 
+CELLS = NetworkConfig(coarse="cosine")
+"""Cells compared one by one, without context."""
+
 
 def make_texture(width: int, height: int, seed: int = 0) -> np.ndarray:
     """(H, W) uint8: smoothed noise of two scales."""
@@ -145,7 +148,7 @@ def test_flat_images_are_no_trouble(matcher, value):
 
 
 def test_no_matches_at_all():
-    strict = HomoMatcher.from_pretrained("light", config=MatchingConfig(min_cosine=1.1))
+    strict = HomoMatcher.from_pretrained("light", config=MatchingConfig(min_cosine=1.1), network=CELLS)
     found = strict.match(make_texture(96, 64), make_texture(96, 64))
     assert len(found) == 0 and found.homography.shape == (0, 3, 3)
     xy1, valid = found.warp(np.array([[3.0, 4.0]]))
@@ -161,7 +164,7 @@ def test_max_matches_keeps_the_most_similar():
 
 def test_the_expectation_head_matches_too(tmp_path):
     torch.manual_seed(0)
-    net = HomoNet(NetworkConfig(head="expectation"))
+    net = HomoNet(NetworkConfig(coarse="cosine", head="expectation"))
     net.backbone.load_state_dict(load_weights("light").backbone.state_dict())
     found = HomoMatcher.from_network(net, MatchingConfig(), ImageConfig()).match(*[make_texture(160, 128)] * 2)
     assert len(found) > 50
@@ -176,7 +179,7 @@ def test_pairs_with_few_good_matches_grow_more():
     turned = cv2.warpAffine(image, turn[:2], (320, 256), flags=cv2.INTER_CUBIC)
 
     def match(grow_below: int) -> PatchMatches:
-        matcher = HomoMatcher.from_pretrained("light", config=MatchingConfig(grow_below=grow_below))
+        matcher = HomoMatcher.from_pretrained("light", config=MatchingConfig(grow_below=grow_below), network=CELLS)
         found = matcher.match(image, turned)
         return found.select(np.flatnonzero(found.score >= 0.5))
 

@@ -23,7 +23,7 @@ from hm_sfm.matching.providers.choice import check_coarse
 from hm_sfm.matching.providers.lightglue import LightGlueCoarse
 from hm_sfm.matching.providers.match_file import MatchFile
 from hm_sfm.matching.providers.sift import SiftCoarse, match_by_ratio
-from hm_sfm.matching.providers.weights import WeightsCoarse
+from hm_sfm.matching.providers.weights import load_coarse
 from hm_sfm.matching.providers.xfeat import XfeatCoarse
 from hm_sfm.network.checkpoints import load_weights, save_weights
 from hm_sfm.network.homography import apply_homography, homography_from_corners
@@ -131,9 +131,12 @@ def test_points_on_the_grid_start_from_the_identity():
 
 
 def test_the_best_are_kept_in_order():
-    pairs = PointPairs(np.eye(4)[:, :2], np.eye(4)[:, 2:], [0.5, 0.9, 0.5, 0.1], index0=[4, 5, 6, 7])
+    pairs = PointPairs(
+        np.eye(4)[:, :2], np.eye(4)[:, 2:], [0.5, 0.9, 0.5, 0.1], place=[0.4, 0.5, 0.6, 0.7], grow="always"
+    )
     kept = pairs.keep_best(3)
-    assert kept.index0.tolist() == [5, 4, 6] and kept.linear is None
+    assert kept.place.tolist() == np.float32([0.5, 0.4, 0.6]).tolist()
+    assert kept.grow == "always" and kept.linear is None
     assert kept.xy0.tolist() == [[0, 1], [1, 0], [0, 0]] and kept.xy1.tolist() == [[0, 0], [0, 0], [1, 0]]
 
 
@@ -299,10 +302,10 @@ def test_a_file_that_is_no_weights_is_refused(tmp_path):
     path = tmp_path / "damaged.pt"
     path.write_bytes(b"no weights")
     with pytest.raises(WeightsError, match="damaged.pt is damaged or no hm_sfm weights file"):
-        WeightsCoarse(path, MatchingConfig(), CPU)
+        load_coarse(path, MatchingConfig(), CPU)
     torch.save({"net.weight": torch.zeros(3)}, path)
     with pytest.raises(WeightsError, match="damaged.pt does not fit the network: missing"):
-        WeightsCoarse(path, MatchingConfig(), CPU)
+        load_coarse(path, MatchingConfig(), CPU)
 
 
 # Files of matches

@@ -15,12 +15,13 @@ from hm_sfm.formats.hloc import check_names, open_h5
 from hm_sfm.matching.cells import CoarseCells
 from hm_sfm.matching.encoder import Encoder
 from hm_sfm.matching.interfaces import CoarseProvider
+from hm_sfm.matching.providers.context import ContextCoarse
 from hm_sfm.matching.providers.lightglue import LightGlueCoarse
 from hm_sfm.matching.providers.match_file import MatchFile, locate_pairs
 from hm_sfm.matching.providers.network import NetworkCoarse
 from hm_sfm.matching.providers.packages import PACKAGES, require_package
 from hm_sfm.matching.providers.sift import SiftCoarse
-from hm_sfm.matching.providers.weights import WeightsCoarse
+from hm_sfm.matching.providers.weights import load_coarse
 from hm_sfm.matching.providers.xfeat import XfeatCoarse
 from hm_sfm.types import ImagePair
 
@@ -62,13 +63,15 @@ def make_provider(config: MatchingConfig, encoder: Encoder) -> CoarseProvider:
     if config.coarse_matches:
         return MatchFile(Path(config.coarse_matches), Path(config.coarse_features) if config.coarse_features else None)
     if config.coarse not in NAMES:
-        return WeightsCoarse(Path(config.coarse), config, encoder.device)
+        return load_coarse(Path(config.coarse), config, encoder.device)
     if config.coarse == "sift":
         return SiftCoarse()
     if config.coarse == "lightglue":
         return LightGlueCoarse(encoder.device)
     if config.coarse == "xfeat":
         return XfeatCoarse(encoder.device)
+    if encoder.net.config.coarse == "context":
+        return ContextCoarse(encoder.net.context)
     return NetworkCoarse(CoarseCells(encoder, config))
 
 

@@ -24,7 +24,8 @@ class NetworkCoarse:
     def match(self, features0: ImageFeatures, features1: ImageFeatures) -> PointPairs:
         """The score is that of the coarse stage. A point is the fine cell nearest to its coarse cell's centre."""
         index0, index1, score = self.cells.match(features0.coarse, features1.coarse)
-        return PointPairs(self._locate(features0, index0), self._locate(features1, index1), score, index0=index0)
+        xy0, xy1 = self._locate(features0, index0), self._locate(features1, index1)
+        return PointPairs(xy0, xy1, score, grow="if few")
 
     def _locate(self, features: ImageFeatures, index: np.ndarray) -> np.ndarray:
         """(M,) int64 coarse cells -> (M, 2) float64 px of the network's input."""

@@ -10,6 +10,7 @@ from hm_sfm.config import MatchingConfig, NetworkConfig
 from hm_sfm.matching.cells import CoarseCells
 from hm_sfm.matching.encoder import Encoder
 from hm_sfm.matching.interfaces import ImageFeatures, PointPairs
+from hm_sfm.matching.providers.context import match_keypoints
 from hm_sfm.network.checkpoints import load_weights, read_checkpoint
 from hm_sfm.photos.images import PreparedImage
 
@@ -17,15 +18,37 @@ LOFTR = NetworkConfig(backbone="loftr", head="expectation", coarse="attention", 
 """What a public LoFTR checkpoint holds; its fine stage is left alone."""
 
 
-class WeightsCoarse:
-    """Matches the coarse cells of another network, whose own fine stage is not used.
+def load_coarse(weights: Path, config: MatchingConfig, device: torch.device) -> "OtherCells | OtherContext":
+    """The provider of a file of weights: its context stage, or its coarse cells where it has none.
 
     Raises WeightsError where the file is missing, damaged, or neither a weights file nor a LoFTR checkpoint.
     """
+    net = load_weights(str(weights), None if "network" in read_checkpoint(weights) else LOFTR)
+    encoder = Encoder(net, device, config.context_keypoints)
+    return OtherContext(encoder) if net.config.coarse == "context" else OtherCells(encoder, config)
 
-    def __init__(self, weights: Path, config: MatchingConfig, device: torch.device) -> None:
-        net = load_weights(str(weights), None if "network" in read_checkpoint(weights) else LOFTR)
-        self.cells = CoarseCells(Encoder(net, device), config)
+
+class OtherContext:
+    """Matches the keypoints of another network in their context; its own fine stage is not used."""
+
+    def __init__(self, encoder: Encoder) -> None:
+        self.encoder = encoder
+
+    def describe(self, image: PreparedImage) -> dict[str, Any]:
+        """`keypoints`, ImageKeypoints."""
+        return {"keypoints": self.encoder.encode_keypoints(image)}
+
+    def match(self, features0: ImageFeatures, features1: ImageFeatures) -> PointPairs:
+        """See match_keypoints."""
+        keypoints0, keypoints1 = (features.description["keypoints"] for features in (features0, features1))
+        return match_keypoints(self.encoder.net.context, keypoints0, keypoints1)
+
+
+class OtherCells:
+    """Matches the coarse cells of another network; its own fine stage is not used."""
+
+    def __init__(self, encoder: Encoder, config: MatchingConfig) -> None:
+        self.cells = CoarseCells(encoder, config)
 
     def describe(self, image: PreparedImage) -> dict[str, Any]:
         """`cells` (H, W, C) float32."""

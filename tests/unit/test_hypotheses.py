@@ -112,8 +112,7 @@ def test_turned_photos_match_as_upright_ones_do(matcher, upright, photo, other, 
 
 def test_a_photo_three_times_closer(matcher, upright, whole, middle):
     as_they_are, good = (
-        matches.select(matches.score >= 0.5)
-        for matches in (upright.match(whole, middle), matcher.match(whole, middle))
+        matches.select(matches.score >= 0.5) for matches in (upright.match(whole, middle), matcher.match(whole, middle))
     )
     assert len(good) > 50
     assert np.count_nonzero(measure_errors(as_they_are, CLOSER) < 3) < len(good) / 4

@@ -61,6 +61,7 @@ def test_merged_shards_are_a_serial_run(tiny_photos, serial, tmp_path, run, read
     assert len(matched_pairs) == 15
 
 
+@pytest.mark.slow
 def test_a_missing_or_unfinished_shard_is_named(
     tiny_photos, serial, tmp_path, run, read_groups, digest_files, monkeypatch
 ):
@@ -93,6 +94,7 @@ def test_a_missing_or_unfinished_shard_is_named(
     assert read_groups(out / "matches.h5") == read_groups(serial)
 
 
+@pytest.mark.slow
 def test_shards_of_other_settings_counts_and_photos_are_refused(tiny_photos, tmp_path, run, digest_files):
     photos = Path(shutil.copytree(tiny_photos, tmp_path / "photos"))
     out = tmp_path / "out"
@@ -111,6 +113,7 @@ def test_shards_of_other_settings_counts_and_photos_are_refused(tiny_photos, tmp
     assert_refused(run("merge", photos, out), "lacks 5 of 15 pairs")
 
 
+@pytest.mark.slow
 def test_nothing_to_merge(tiny_photos, tmp_path, run):
     out = tmp_path / "out"
     assert run("match", tiny_photos, out).code == 0
@@ -136,6 +139,7 @@ def test_more_shards_than_pairs(tiny_photos, tmp_path, run):
     assert run("merge", tiny_photos, out).out == f"2 pairs: {out / 'matches.h5'}\n"
 
 
+@pytest.mark.slow
 def test_one_process_at_a_time(tiny_photos, tmp_path, run, digest_files):
     out = tmp_path / "out"
     assert run("match", tiny_photos, out).code == 0
@@ -150,6 +154,7 @@ def test_one_process_at_a_time(tiny_photos, tmp_path, run, digest_files):
     assert run("match", tiny_photos, out).code == 0
 
 
+@pytest.mark.slow
 def test_shards_run_side_by_side_but_none_twice(tiny_photos, tmp_path, run):
     out = tmp_path / "out"
     assert run("match", tiny_photos, out, "--shard", "1/2").code == 0
@@ -163,6 +168,7 @@ def test_shards_run_side_by_side_but_none_twice(tiny_photos, tmp_path, run):
     assert run("merge", tiny_photos, out).code == 0
 
 
+@pytest.mark.slow
 def test_shards_selected_by_appearance_encode_one_after_the_other(tiny_photos, tmp_path, run, monkeypatch):
     out = tmp_path / "out"
     (out / "retrieval").mkdir(parents=True)
@@ -181,6 +187,7 @@ def test_shards_selected_by_appearance_encode_one_after_the_other(tiny_photos, t
     assert held == [True]
 
 
+@pytest.mark.slow
 def test_a_folder_without_locks_is_used_all_the_same(tiny_photos, tmp_path, run, monkeypatch):
     def refuse(*_):
         raise OSError(95, "Operation not supported")
@@ -195,6 +202,7 @@ def test_a_cache_too_small_for_a_pair(limit_mb, scene, tmp_path, run):
     assert_refused(finished, f"matching.feature_cache_mb is {limit_mb}", "view_00.jpg and view_01.jpg alone take", "MB")
 
 
+@pytest.mark.slow
 def test_a_cache_of_one_pair_changes_no_match(tiny_photos, serial, tmp_path, run, read_groups):
     finished = run("match", tiny_photos, tmp_path / "out", "--set", "matching.feature_cache_mb=1")
     assert finished.code == 0, finished.err

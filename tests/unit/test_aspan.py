@@ -366,6 +366,7 @@ def test_the_short_training_is_one_of_the_coarse_stage_on_rendered_scenes():
     assert config.stage == "coarse" and config.rendered_share == 1 and Path(config.start_from).exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["coarse", "joint"])
 def test_the_loop_trains_it_by_matches_and_flow(training, stage):
     network = dataclasses.replace(training.network, coarse="aspan")

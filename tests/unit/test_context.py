@@ -35,6 +35,7 @@ def photos() -> list[np.ndarray]:
     return [np.ascontiguousarray(view) for view in (texture[40:360, 40:480], texture[y : y + 320, x : x + 440])]
 
 
+@pytest.mark.slow
 def test_keypoints_match_and_grow_over_the_image(matcher, photos):
     features = [matcher.encode(prepare_array(photo, 1024)) for photo in photos]
     points = matcher.provider.match(*features)
@@ -47,6 +48,7 @@ def test_keypoints_match_and_grow_over_the_image(matcher, photos):
     assert np.percentile(np.linalg.norm(good.xy1 - good.xy0 - SHIFT, axis=1), 90) < 1
 
 
+@pytest.mark.slow
 def test_the_score_is_no_more_than_the_probability_of_the_place(matcher, photos):
     features = [matcher.encode(prepare_array(photo, 1024)) for photo in photos]
     matches = matcher.match_features(*features)
@@ -95,6 +97,7 @@ def test_memory_counts_the_keypoints(matcher, photos):
     assert features.size_bytes - without.size_bytes == features.keypoints.nbytes > 0
 
 
+@pytest.mark.slow
 def test_other_weights_with_context_match_their_keypoints(matcher, photos):
     provider = load_coarse(find_weights("light"), MatchingConfig(), CPU)
     assert isinstance(provider, OtherContext)

@@ -192,10 +192,12 @@ def measure_grid_error(matcher, waves, image) -> float:
     return float(difference[0] - difference[1]) / (4 * math.sin(math.radians(25.0)))
 
 
+@pytest.mark.slow
 def test_the_fine_grid_is_where_it_says(matcher, waves, image):
     assert abs(measure_grid_error(matcher, waves, image)) < OFFSET_LIMIT_PX
 
 
+@pytest.mark.slow
 def test_a_fine_grid_half_a_pixel_off_would_be_seen(matcher, waves, image, monkeypatch):
     monkeypatch.setattr(LightBackbone, "fine_grid", Grid(FINE.stride, FINE.offset - 0.5))
     assert abs(measure_grid_error(matcher, waves, image)) > 0.3

@@ -72,6 +72,7 @@ def test_a_sequence_is_loaded_once_in_any_order_of_its_pairs():
     assert count_loads(order_pairs(pairs, 10), 10) == 500
 
 
+@pytest.mark.slow
 def test_neighbours_in_the_plane_are_loaded_a_few_times_in_a_cache_of_one_per_cent():
     xy = np.random.default_rng(0).uniform(size=(1000, 2))
     nearest = np.argsort(((xy[:, None] - xy) ** 2).sum(axis=2), axis=1)[:, 1:21]

@@ -22,8 +22,8 @@ MARGIN_PX = 128
 class Encoder:
     """A network on a device, ready to encode images. The network is moved there and frozen."""
 
-    def __init__(self, net: HomoNet, device: torch.device, max_keypoints: int = 2048) -> None:
-        """max_keypoints: that are matched in context, see MatchingConfig."""
+    def __init__(self, net: HomoNet, device: torch.device, max_keypoints: int) -> None:
+        """max_keypoints: of an image, best first, that a network with context matches; others find none."""
         self.device, self.max_keypoints = device, max_keypoints
         self.net = net.to(device).eval().requires_grad_(False)
         # Half the time on a CPU. PyTorch's own type hints lack this argument of a module.
@@ -72,6 +72,12 @@ class Encoder:
             strips.append(fine[:, :, (top - first) // stride : (bottom - first) // stride])
         return make_fine_map(torch.cat(strips, dim=2))
 
+    @torch.inference_mode()
+    def encode_keypoints(self, image: PreparedImage) -> ImageKeypoints:
+        """The keypoints alone, of a network that matches them in context."""
+        pixels = self._pad(image)
+        return self._find_keypoints(pixels, self._run_backbone(pixels, want_fine=False).coarse, image)
+
     def _pad(self, image: PreparedImage) -> Tensor:
         backbone = self.net.backbone
         return pad_image(torch.tensor(image.grey, device=self.device), backbone.stride, backbone.standardised)
@@ -79,12 +85,6 @@ class Encoder:
     def _run_backbone(self, pixels: Tensor, want_fine: bool = True) -> FeatureMaps:
         with autocast(self.device):
             return self.net.backbone(pixels, want_fine)
-
-    @torch.inference_mode()
-    def encode_keypoints(self, image: PreparedImage) -> ImageKeypoints:
-        """The keypoints alone, of a network that matches them in context."""
-        pixels = self._pad(image)
-        return self._find_keypoints(pixels, self._run_backbone(pixels, want_fine=False).coarse, image)
 
     def _find_keypoints(self, pixels: Tensor, coarse: Tensor, image: PreparedImage) -> ImageKeypoints:
         """pixels, coarse: what the backbone is given, and its map at 1/8."""

@@ -281,7 +281,7 @@ def test_a_thousand_photos_need_few_pairs(monkeypatch, tmp_path):
 def test_plain_features_are_those_that_the_coarse_stage_starts_from(backbone, coarse):
     torch.manual_seed(0)
     net = HomoNet(NetworkConfig(backbone=backbone, coarse=coarse))
-    encoder = Encoder(net, torch.device("cpu"))
+    encoder = Encoder(net, torch.device("cpu"), max_keypoints=0)
     image = prepare_array(np.random.default_rng(0).integers(0, 255, (64, 100), np.uint8), 1024)
     plain, described = torch.tensor(encoder.encode_plain(image)), encoder.encode(image).coarse
     assert plain.dtype == torch.float32 and len(plain) == len(described) == 8 * (12 if backbone == "light" else 13)

@@ -21,4 +21,7 @@ def autocast(device: torch.device) -> torch.autocast:
 
 def computes_in_half(device: torch.device) -> bool:
     """Whether the processor computes in half precision natively; fine features take 2 bytes a number then, not 4."""
-    return device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()
+    if device.type == "cuda":
+        return True
+    # Whoever limits PyTorch to lesser instructions (ATEN_CPU_CAPABILITY=avx2) would get bf16 emulated, and slow.
+    return torch.cpu._is_avx512_bf16_supported() and torch.backends.cpu.get_cpu_capability() == "AVX512"

@@ -12,7 +12,7 @@ from hm_sfm.colmap.models import find_known
 from hm_sfm.colmap.rigs import assign_cameras, read_rigs
 from hm_sfm.config import CameraConfig
 from hm_sfm.errors import ConfigError, InputError
-from hm_sfm.photos.bitmaps import read_bitmap
+from hm_sfm.photos.bitmaps import read_bitmap, read_camera_label
 from hm_sfm.types import ImageRef
 
 # The first guess of a focal length that nothing is known about, relative to the longer side. COLMAP's 1.2 is too long
@@ -167,7 +167,7 @@ def _read_exif_focal(image: ImageRef) -> _ExifFocal:
     bitmap = read_bitmap(image.path, as_rgb=False)
     if bitmap is None:
         raise InputError(f"cannot read {image.path}: it is not an image that COLMAP can open")
-    return _ExifFocal(bitmap.exif_focal_length(), bitmap.exif_camera_model())
+    return _ExifFocal(bitmap.exif_focal_length(), read_camera_label(bitmap))
 
 
 def _make_camera(

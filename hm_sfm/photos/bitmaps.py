@@ -40,6 +40,17 @@ def read_bitmap(path: Path, as_rgb: bool) -> pycolmap.Bitmap | None:
     return bitmap
 
 
+def read_camera_label(bitmap: pycolmap.Bitmap) -> str | None:
+    """Make, model, focal length and size as COLMAP compares cameras by them; None where EXIF has no make or model.
+
+    Cameras write their names in any encoding: what is not UTF-8 is taken for Latin-1, which reads every byte.
+    """
+    try:
+        return bitmap.exif_camera_model()
+    except UnicodeDecodeError as error:
+        return bytes(error.object).decode("latin-1")
+
+
 def _read_heic(path: Path, as_rgb: bool) -> pycolmap.Bitmap | None:
     if not can_read_heic():
         raise MissingPackageError(f"{path} is HEIC, which needs the package pillow-heif: {INSTALL_HEIC}")

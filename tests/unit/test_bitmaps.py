@@ -128,3 +128,27 @@ def test_colmap_gets_files_that_it_can_read(tmp_path):
     assert not folder.exists() and folder != tmp_path
     with open_to_colmap(images[:1], tmp_path) as folder:
         assert folder == tmp_path  # nothing to do
+
+
+def test_names_of_cameras_in_any_encoding(tmp_path):
+    for name, maker in {"a": "Plötz", "b": "Plötz", "c": "Plätz"}.items():
+        write_photo(tmp_path / f"{name}.jpg", textured(64, 48))
+        data = (tmp_path / f"{name}.jpg").read_bytes()
+        assert data.count(b"Phone") == 1
+        (tmp_path / f"{name}.jpg").write_bytes(data.replace(b"Phone", maker.encode("latin-1")))
+    cameras = make_cameras(list_images(tmp_path).images, CameraConfig())
+    assert cameras.camera_index == (0, 0, 1) and all(camera.has_prior_focal_length for camera in cameras.cameras)
+
+
+def test_no_byte_of_exif_ends_a_run(tmp_path):
+    path = write_photo(tmp_path / "a.jpg", textured(64, 48), 6)
+    whole = path.read_bytes()
+    start = whole.index(b"Exif")
+    end = start - 2 + int.from_bytes(whole[start - 2 : start], "big")
+    rng = np.random.default_rng(0)
+    for count in (1, 3, 30) * 20:
+        data = np.frombuffer(whole, np.uint8).copy()
+        data[rng.integers(start, end, count)] = rng.integers(0, 256, count)
+        path.write_bytes(data.tobytes())
+        photo = read_ref(path)
+        assert photo.size_wh == (64, 48) and len(make_cameras([photo], CameraConfig()).cameras) == 1

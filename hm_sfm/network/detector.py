@@ -46,14 +46,26 @@ def detect_keypoints(
 
     size_wh: what of the padded image is the photo. The score is the product of probability and reliability.
     """
-    window = SUPPRESSION_PX
-    largest = F.max_pool2d(probability[None, None], window, stride=1, padding=window // 2)[0, 0]
-    peak = (probability == largest) & (probability > MIN_DETECTION)
+    peak = (probability == find_largest_around(probability)) & (probability > MIN_DETECTION)
     y, x = peak[: size_wh[1], : size_wh[0]].nonzero(as_tuple=True)
     xy = torch.stack([x, y], dim=1) + 0.5
     score = probability[y, x] * sample_map(reliability[None], xy)[:, 0]
     order = score.argsort(descending=True, stable=True)[:most]
     return xy[order], score[order]
+
+
+def find_largest_around(values: Tensor) -> Tensor:
+    """The largest value of the window of SUPPRESSION_PX around each pixel, (H, W).
+
+    What max_pool2d gives, but along one axis after the other, which is faster.
+    """
+    reach = SUPPRESSION_PX // 2
+    for axis, padding in enumerate(((0, 0, reach, reach), (reach, reach, 0, 0))):
+        padded, size = F.pad(values, padding, value=-torch.inf), values.shape[axis]
+        for shift in range(SUPPRESSION_PX):
+            shifted = padded.narrow(axis, shift, size)
+            values = torch.maximum(values, shifted) if shift else shifted
+    return values
 
 
 def sample_map(maps: Tensor, xy: Tensor, mode: str = "bilinear") -> Tensor:

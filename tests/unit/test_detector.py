@@ -5,7 +5,13 @@ import torch
 import torch.nn.functional as F
 
 from hm_sfm.network.checkpoints import load_weights
-from hm_sfm.network.detector import describe_keypoints, detect_keypoints, sample_map
+from hm_sfm.network.detector import (
+    SUPPRESSION_PX,
+    describe_keypoints,
+    detect_keypoints,
+    find_largest_around,
+    sample_map,
+)
 
 
 def make_probability(peaks: dict[tuple[int, int], float], size_wh=(64, 48)) -> torch.Tensor:
@@ -68,3 +74,10 @@ def test_a_bright_dot_is_detected_where_it_is():
         coarse = net.backbone(image, want_fine=False).coarse
         xy, _ = detect_keypoints(*net.detector(image, coarse), (128, 96), 1)
     assert (xy[0] - torch.tensor([71.5, 45.5])).abs().max() <= 1.0
+
+
+@pytest.mark.parametrize("size_hw", [(1, 1), (2, 9), (40, 24)])
+def test_the_largest_value_around_a_pixel_is_that_of_its_window(size_hw):
+    values = torch.randint(0, 9, size_hw, generator=torch.Generator().manual_seed(0)).float()
+    expected = F.max_pool2d(values[None], SUPPRESSION_PX, stride=1, padding=SUPPRESSION_PX // 2)[0]
+    assert torch.equal(find_largest_around(values), expected)

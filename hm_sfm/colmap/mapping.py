@@ -9,7 +9,7 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -21,6 +21,7 @@ import pycolmap
 from hm_sfm.colmap.cameras import Cameras
 from hm_sfm.colmap.database import open_database
 from hm_sfm.colmap.rigs import lack_poses
+from hm_sfm.colmap.scaled_database import copy_scaled, needs_scaling, restore_px
 from hm_sfm.colmap.snapshots import SNAPSHOT_FOLDER, Snapshots, digest_inputs
 from hm_sfm.config import MappingConfig, VerificationConfig
 from hm_sfm.io.colmap_log import quiet_colmap
@@ -56,9 +57,12 @@ class MappingTask:
     """The models go to its subfolders 0, 1, ..., as COLMAP binary; what it held before is gone then."""
     config: MappingConfig = field(default_factory=MappingConfig)
     max_error_px: float = VerificationConfig().max_error_px
-    """Px of the stored images, whatever their size: observations farther than this from their point are dropped.
-    COLMAP's own 4 px are meant for keypoints that are less exact. Calibration before global mapping allows the same
-    error in photos of 1000 px, and as much more as photos are larger."""
+    """Px of the matching resolution: observations farther than this from their point are dropped. COLMAP's own 4 px are
+    meant for keypoints that are less exact. Calibration before global mapping allows the same error in photos of 1000
+    px, and as much more as photos are larger."""
+    px_scale: Mapping[str, float] = field(default_factory=dict)
+    """By image name, px of the stored image per px of the matching resolution; 1 where it is left out. All limits of
+    the mappers that count px count them at the matching resolution."""
     fix_intrinsics: bool = False
     """Keep all cameras as the database has them."""
     on_image: Callable[[], object] | None = None
@@ -128,7 +132,7 @@ def map_incrementally(task: MappingTask) -> tuple[pycolmap.Reconstruction, ...]:
     Returns the models, most registered images first, then most points; the sparse folder has them in this order.
     Without a model there is no folder. Raises InputError where there is no database.
     """
-    return _write_models(task, partial(_run_mapper, task))
+    return _write_models(task, _run_mapper)
 
 
 def map_globally(task: MappingTask) -> tuple[pycolmap.Reconstruction, ...]:
@@ -142,7 +146,7 @@ def map_globally(task: MappingTask) -> tuple[pycolmap.Reconstruction, ...]:
     persist_keypoints guarantee: it stops at a match that occurs twice, and drops tracks whose observations in one image
     are more than 10 px apart.
     """
-    return _write_models(task, partial(_run_global_mapper, task))
+    return _write_models(task, _run_global_mapper)
 
 
 def triangulate_images(
@@ -155,13 +159,15 @@ def triangulate_images(
     Returns one model with all images, or none where there are no points; the sparse folder is as map_incrementally
     leaves it. Raises InputError where there is no database.
     """
-    return _write_models(task, partial(_run_triangulator, task, images, cameras))
+    return _write_models(replace(task, fix_intrinsics=True), partial(_run_triangulator, images, cameras))
 
 
 def _write_models(
-    task: MappingTask, build: Callable[[Path], list[pycolmap.Reconstruction]]
+    task: MappingTask, build: Callable[[MappingTask, Path], list[pycolmap.Reconstruction]]
 ) -> tuple[pycolmap.Reconstruction, ...]:
-    """Sort the models that `build` makes, given a new folder to work in, and put them in the sparse folder's place.
+    """Sort the models that `build` makes, and put them in the sparse folder's place.
+
+    build: is given the task, with a database in px of the matching resolution, and a new folder to work in.
 
     Snapshots of them are then removed, and so is what killed processes left. Without verified matches there is nothing
     to build. Raises InputError where there is no database.
@@ -177,7 +183,7 @@ def _write_models(
             raw.mkdir()
             # The one error that COLMAP logs here is that there is no model, which the caller is told anyway.
             with quiet_colmap(pycolmap.logging.FATAL):
-                models = build(raw)
+                models = _build_scaled(task, build, raw)
         models.sort(key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
 
         finished = work_folder / "sparse"
@@ -193,6 +199,21 @@ def _write_models(
         if snapshots.exists():  # all of them at once: none is left with files missing
             os.replace(snapshots, work_folder / "snapshots")
     return tuple(models)
+
+
+def _build_scaled(
+    task: MappingTask, build: Callable[[MappingTask, Path], list[pycolmap.Reconstruction]], folder: Path
+) -> list[pycolmap.Reconstruction]:
+    """What `build` makes of the database in px of the matching resolution, in px of the stored photos."""
+    if not needs_scaling(task.px_scale):
+        return build(task, folder)
+    scaled = folder.with_name("scaled.db")
+    copy_scaled(task.database, scaled, task.px_scale)
+    models = build(replace(task, database=scaled), folder)
+    for model in models:
+        restore_px(model, task.database, task.px_scale, task.fix_intrinsics)
+        model.extract_colors_for_all_images(task.image_folder)
+    return models
 
 
 @contextmanager
@@ -240,6 +261,7 @@ def _pipeline_options(task: MappingTask) -> pycolmap.IncrementalPipelineOptions:
     options.random_seed = task.config.seed
     options.min_model_size = task.config.min_model_size
     options.mapper.filter_max_reproj_error = task.max_error_px
+    options.extract_colors = not needs_scaling(task.px_scale)  # the mapper would look for them at the scaled keypoints
     options.ba_global_frames_ratio = GLOBAL_ADJUSTMENT_RATIO
     options.ba_global_points_ratio = GLOBAL_ADJUSTMENT_RATIO
     options.ba_global_function_tolerance = GLOBAL_TOLERANCE
@@ -307,16 +329,17 @@ def _map_all(task: MappingTask, output_folder: Path) -> list[pycolmap.Reconstruc
 
 
 def _run_triangulator(
-    task: MappingTask, images: Sequence[ImageRef], cameras: Cameras, output_folder: Path
+    images: Sequence[ImageRef], cameras: Cameras, task: MappingTask, output_folder: Path
 ) -> list[pycolmap.Reconstruction]:
     model = pycolmap.Reconstruction()
-    for camera in cameras.cameras:
-        model.add_camera_with_trivial_rig(camera)
+    with open_database(task.database) as database:
+        for camera in database.read_all_cameras():
+            model.add_camera_with_trivial_rig(camera)
     rows = zip(images, cameras.camera_index, cameras.cam_from_world, strict=True)
     for image_id, (image, index, cam_from_world) in enumerate(rows, start=1):  # the ids of write_database
         row = pycolmap.Image(name=image.name, camera_id=cameras.cameras[index].camera_id, image_id=image_id)
         model.add_image_with_trivial_frame(row, cam_from_world)
-    options = _pipeline_options(replace(task, fix_intrinsics=True))
+    options = _pipeline_options(task)
     model = pycolmap.triangulate_points(model, task.database, task.image_folder, output_folder, options=options)
     if not model.num_points3D():
         return []

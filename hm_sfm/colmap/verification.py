@@ -4,8 +4,10 @@ Ctrl-C raises KeyboardInterrupt out of each of these functions within a second o
 """
 
 import os
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ import pycolmap
 from tqdm import tqdm
 
 from hm_sfm.colmap.database import open_database
+from hm_sfm.colmap.scaled_database import copy_scaled, needs_scaling, scale_camera, scale_geometry
 from hm_sfm.config import VerificationConfig
 from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.types import ImagePair, ImageRef, PairMatches, PatchMatches, freeze_array
@@ -26,6 +29,10 @@ FIT_MATCHES = 1000
 
 # Enough for 30 % inliers; pairs with more stop earlier, and pairs of different places need none.
 MAX_TRIALS = 1500
+
+KINDS = pycolmap.TwoViewGeometryConfiguration
+# A plane or a rotation explains the pair. These have an essential matrix, too, where both focal lengths are known.
+PLANAR_KINDS = tuple(map(int, (KINDS.PLANAR, KINDS.PANORAMIC, KINDS.PLANAR_OR_PANORAMIC)))
 
 
 @dataclass(frozen=True)
@@ -60,53 +67,69 @@ def verify_pair(
     camera0: pycolmap.Camera,
     camera1: pycolmap.Camera,
     config: VerificationConfig,
-    px_scale: float = 1.0,
+    px_scale: tuple[float, float] = (1.0, 1.0),
     seed: int = 0,
 ) -> np.ndarray:
     """Which matches agree with the two-view geometry of their images.
 
     camera0, camera1: of image 0 and 1; where both have a known focal length, the geometry is calibrated. Pairs that
-    see a plane, or that only rotate, are valid: matches then agree with a homography.
-    px_scale: px of the stored images per px at the matching resolution, the larger of the two.
+    see a plane, or that only rotate, are valid: matches then agree with a homography, or with an essential matrix, for
+    which unknown focal lengths are taken as the cameras have them.
+    px_scale: of image 0 and 1, px of the stored image per px at the matching resolution.
 
     Returns (M,) bool, the same for the same seed; all False where fewer than `config.min_inliers` or a smaller part
     than `config.min_inlier_ratio` of the matches agree, and for fewer than 8 matches. Scores are not looked at.
     """
-    max_error_px = config.max_error_px * px_scale
     rejected = np.zeros(len(matches), dtype=bool)
     if len(matches) < MIN_MATCHES:
         return rejected
-    xy0 = matches.xy0.astype(np.float64)
-    xy1 = matches.xy1.astype(np.float64)
+    xy0 = matches.xy0.astype(np.float64) / px_scale[0]
+    xy1 = matches.xy1.astype(np.float64) / px_scale[1]
+    cameras = [scale_camera(camera, scale) for camera, scale in zip((camera0, camera1), px_scale)]
+    kind, inliers = _find_inliers(xy0, xy1, cameras, config.max_error_px, seed)
+    if kind in PLANAR_KINDS and not all(camera.has_prior_focal_length for camera in cameras):
+        # COLMAP then looks for a homography only. Any focal length will do for an essential matrix of the plane and
+        # what stands before it: it has enough freedom to make up for the wrong one.
+        for camera in cameras:
+            camera.has_prior_focal_length = True
+        inliers = max(inliers, _find_inliers(xy0, xy1, cameras, config.max_error_px, seed)[1], key=np.count_nonzero)
+    accepted = np.count_nonzero(inliers) >= max(config.min_inliers, config.min_inlier_ratio * len(matches))
+    return inliers if accepted else rejected
+
+
+def _find_inliers(
+    xy0: np.ndarray, xy1: np.ndarray, cameras: Sequence[pycolmap.Camera], max_error_px: float, seed: int
+) -> tuple[int, np.ndarray]:
+    """The kind of the two-view geometry of matches (M, 2), px as `cameras` have them, and (M,) bool: which agree.
+
+    The kind is a value of TwoViewGeometryConfiguration.
+    """
     # Matches come best first: even steps keep the mixture of good and bad, and the spread over the image.
-    chosen = np.linspace(0, len(matches) - 1, min(len(matches), FIT_MATCHES)).round().astype(np.int64)
+    chosen = np.linspace(0, len(xy0) - 1, min(len(xy0), FIT_MATCHES)).round().astype(np.int64)
     identity = np.repeat(np.arange(len(chosen), dtype=np.uint32)[:, None], 2, axis=1)
     with quiet_colmap():
         geometry = pycolmap.estimate_two_view_geometry(
-            camera0,
+            cameras[0],
             xy0[chosen],
-            camera1,
+            cameras[1],
             xy1[chosen],
             identity,
             _two_view_options(max_error_px, MIN_MATCHES, 0.0, seed),
         )
-
-    kinds = pycolmap.TwoViewGeometryConfiguration
-    kind = kinds(geometry.config)
-    inliers = rejected
-    if kind == kinds.UNCALIBRATED and geometry.F is not None:
+    kind = geometry.config
+    inliers = np.zeros(len(xy0), dtype=bool)
+    if kind == int(KINDS.UNCALIBRATED) and geometry.F is not None:
         inliers = _epipolar_inliers(xy0, xy1, geometry.F, max_error_px)
-    elif kind in (kinds.CALIBRATED, kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):
+    elif kind == int(KINDS.CALIBRATED) or kind in PLANAR_KINDS:
         # As COLMAP does: a plane that dominates the pair must not cost it what stands before the plane.
         if geometry.E is not None:
-            max_error = float(np.mean([camera.cam_from_img_threshold(max_error_px) for camera in (camera0, camera1)]))
-            rays0, rays1 = np.asarray(camera0.cam_from_img(xy0)), np.asarray(camera1.cam_from_img(xy1))
+            max_error = float(np.mean([camera.cam_from_img_threshold(max_error_px) for camera in cameras]))
+            rays0, rays1 = (np.asarray(camera.cam_from_img(xy)) for camera, xy in zip(cameras, (xy0, xy1)))
             inliers = _epipolar_inliers(rays0, rays1, geometry.E, max_error)
-        if kind != kinds.CALIBRATED and geometry.H is not None:
+        if kind != int(KINDS.CALIBRATED) and geometry.H is not None:
             planar = _planar_inliers(xy0, xy1, geometry.H, max_error_px)
             inliers = max(inliers, planar, key=np.count_nonzero)
-    accepted = np.count_nonzero(inliers) >= max(config.min_inliers, config.min_inlier_ratio * len(matches))
-    return inliers if accepted else rejected
+    return kind, inliers
 
 
 def _epipolar_inliers(xy0: np.ndarray, xy1: np.ndarray, matrix: np.ndarray, max_error: float) -> np.ndarray:
@@ -135,7 +158,7 @@ def verify_pairs(
     """verify_pair for many pairs; pairs that are rejected are left out.
 
     read: gives the matches of a pair. cameras, px_scale: by image name; px_scale is px of the stored image per px at
-    the matching resolution, in which `config` states the error. quiet: no progress bar.
+    the matching resolution, in which `config` states the error of each image. quiet: no progress bar.
     """
     size_wh = {image.name: image.size_wh for image in images}
     verified = {}
@@ -147,7 +170,7 @@ def verify_pairs(
             cameras[pair.name0],
             cameras[pair.name1],
             config,
-            max(px_scale[pair.name0], px_scale[pair.name1]),
+            (px_scale[pair.name0], px_scale[pair.name1]),
         )
         if is_convincing(int(np.count_nonzero(agreeing)), len(confident), config):
             inliers = np.zeros(len(matches), dtype=bool)
@@ -178,19 +201,84 @@ def measure_cover(xy: np.ndarray, size_wh: tuple[int, int]) -> float:
 
 
 def verify_database(
-    path: Path, config: VerificationConfig, px_scale: float = 1.0, seed: int = 0, num_threads: int = -1
+    path: Path,
+    config: VerificationConfig,
+    px_scale: Mapping[str, float] | None = None,
+    seed: int = 0,
+    num_threads: int = -1,
 ) -> None:
     """Estimate the two-view geometry of all matched pairs of a database and store it there, replacing earlier ones.
 
-    px_scale: px of the stored images per px at the matching resolution, in which `config` states the error; the largest
-    of all images. num_threads: -1 takes all cores. Raises InputError where there is no database.
+    px_scale: by image name, px of the stored image per px at the matching resolution, in which `config` states the
+    error of each image; 1 for images that it leaves out. Cameras without a known focal length are used as in
+    verify_pair. num_threads: -1 takes all cores. Raises InputError where there is no database.
     """
+    px_scale = px_scale or {}
+    path = Path(path)
     with open_database(path) as database:
         database.clear_two_view_geometries()  # pycolmap skips pairs that have one
+    verify = partial(_verify_missing, config=config, seed=seed, num_threads=num_threads)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+        copy = Path(folder) / "copy.db"
+        if needs_scaling(px_scale):
+            copy_scaled(path, copy, px_scale)
+            verify(copy)
+            _copy_geometries(copy, path, px_scale)
+        else:
+            verify(path)
+        if planar := _list_unfocused_planar(path):
+            copy_scaled(path, copy, px_scale)
+            _forget(copy, planar)
+            verify(copy)
+            _add_inliers(copy, path, planar)
+
+
+def _verify_missing(path: Path, config: VerificationConfig, seed: int, num_threads: int) -> None:
+    """Estimate the two-view geometries that a database lacks."""
     verifier = pycolmap.GeometricVerifierOptions(num_threads=num_threads)
     # Ctrl-C takes effect between batches.
     pairing = pycolmap.ExistingMatchedPairingOptions(batch_size=4 * (os.cpu_count() or 1))
-    max_error_px = config.max_error_px * px_scale
-    options = _two_view_options(max_error_px, config.min_inliers, config.min_inlier_ratio, seed)
+    options = _two_view_options(config.max_error_px, config.min_inliers, config.min_inlier_ratio, seed)
     with quiet_colmap():
         pycolmap.geometric_verification(path, verifier, pairing, options)
+
+
+def _copy_geometries(copy: Path, path: Path, px_scale: Mapping[str, float]) -> None:
+    """Write the two-view geometries of a copy_scaled to its original, which has none."""
+    with open_database(copy) as scaled, open_database(path) as database, pycolmap.DatabaseTransaction(database):
+        scale = {image.image_id: px_scale.get(image.name, 1.0) for image in scaled.read_all_images()}
+        for pair_id, geometry in zip(*scaled.read_two_view_geometries()):
+            id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
+            scale_geometry(geometry, 1 / scale[id0], 1 / scale[id1])
+            database.write_two_view_geometry(id0, id1, geometry)
+
+
+def _list_unfocused_planar(path: Path) -> list[tuple[int, int]]:
+    """The image ids of the pairs whose geometry is planar and was estimated without focal lengths."""
+    with open_database(path) as database:
+        unknown = {camera.camera_id for camera in database.read_all_cameras() if not camera.has_prior_focal_length}
+        images = {image.image_id for image in database.read_all_images() if image.camera_id in unknown}
+        rows = zip(*database.read_two_view_geometries())
+        planar = [pycolmap.pair_id_to_image_pair(row) for row, geometry in rows if geometry.config in PLANAR_KINDS]
+    return [pair for pair in planar if images.intersection(pair)]
+
+
+def _forget(path: Path, pairs: Sequence[tuple[int, int]]) -> None:
+    """Remove two-view geometries, and claim that all focal lengths are known."""
+    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
+        for pair in pairs:
+            database.delete_two_view_geometry(*pair)
+        for camera in database.read_all_cameras():
+            camera.has_prior_focal_length = True
+            database.update_camera(camera)
+
+
+def _add_inliers(copy: Path, path: Path, pairs: Sequence[tuple[int, int]]) -> None:
+    """Give the two-view geometries of these pairs the inliers that they have in the copy, where these are more."""
+    with open_database(copy) as other, open_database(path) as database, pycolmap.DatabaseTransaction(database):
+        for pair in pairs:
+            geometry = database.read_two_view_geometry(*pair)
+            matches = other.read_two_view_geometry(*pair).inlier_matches
+            if len(matches) > len(geometry.inlier_matches):
+                geometry.inlier_matches = matches
+                database.update_two_view_geometry(*pair, geometry)

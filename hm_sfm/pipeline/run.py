@@ -180,7 +180,7 @@ def write_verified(
 ) -> None:
     """A new database, see write_database, with the two-view geometries of all its pairs."""
     write_database(path, collection.images, collection.cameras, keypoints, matches)
-    verify_database(path, config.verification, max(measure_px_scales(collection.images, config).values()))
+    verify_database(path, config.verification, measure_px_scales(collection.images, config))
 
 
 def map_database(
@@ -194,6 +194,7 @@ def map_database(
             path.with_name("sparse"),
             config.mapping,
             config.verification.max_error_px,
+            measure_px_scales(collection.images, config),
             on_image=progress.update,
         )
         return map_images(task, collection.images, collection.cameras)

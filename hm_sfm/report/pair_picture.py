@@ -65,8 +65,8 @@ def draw_pair(matcher: HomoMatcher, path_a: Path, path_b: Path, checks: Verifica
     good = matches.select(matches.score >= checks.min_score)
     # One by one: photos of two folders may have the same name.
     camera_a, camera_b = (make_cameras([ref], CameraConfig()).cameras[0] for ref in refs)
-    px_scale = max(1.0, max(max(ref.size_wh) for ref in refs) / matcher.images.long_edge_px)
-    agreeing = verify_pair(good, camera_a, camera_b, checks, px_scale)
+    scale_a, scale_b = (max(1.0, max(ref.size_wh) / matcher.images.long_edge_px) for ref in refs)
+    agreeing = verify_pair(good, camera_a, camera_b, checks, (scale_a, scale_b))
     count = int(np.count_nonzero(agreeing))
     is_verified = is_convincing(count, len(good), checks)
 

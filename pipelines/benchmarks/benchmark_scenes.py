@@ -99,8 +99,9 @@ def build_model(folder: Path, images: Sequence[ImageRef], method: str, run: Path
     database = run / "database.db"
     run.mkdir(parents=True, exist_ok=True)
     write_database(database, images, make_cameras(images, config.cameras), keypoints, matches)
-    verify_database(database, config.verification, max(measure_px_scales(images, config).values()))
-    models = map_incrementally(MappingTask(database, folder, run / "sparse", config.mapping))
+    px_scale = measure_px_scales(images, config)
+    verify_database(database, config.verification, px_scale)
+    models = map_incrementally(MappingTask(database, folder, run / "sparse", config.mapping, px_scale=px_scale))
     return summarise_models(models, len(images))
 
 

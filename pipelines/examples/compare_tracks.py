@@ -70,8 +70,10 @@ def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:
         (out / name).mkdir(exist_ok=True)
         database = out / name / "database.db"
         write_database(database, images, cameras, keypoints, matches)
-        verify_database(database, config.verification, max(px_scale.values()))
-        models = map_incrementally(MappingTask(database, photos, out / name / "sparse", config.mapping))
+        verify_database(database, config.verification, px_scale)
+        models = map_incrementally(
+            MappingTask(database, photos, out / name / "sparse", config.mapping, px_scale=px_scale)
+        )
         result = summarise_models(models, len(images))
         print(f"{name}: {result.registered} of {len(images)} images, {result.points} points", end=", ")
         print(f"tracks of {result.mean_track_length:.2f} images, {result.mean_reprojection_px:.3f} px")

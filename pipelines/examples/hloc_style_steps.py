@@ -50,8 +50,8 @@ def run_hloc_style_steps(photos: Path, out: Path) -> None:
     print(f"{sum(map(len, keypoints))} keypoints, {sum(map(len, matches))} matches in {len(pairs)} pairs")
     database = hloc / "database.db"
     write_database(database, images, make_cameras(images, config.cameras), keypoints, matches)
-    verify_database(database, config.verification, max(px_scale.values()))
-    models = map_incrementally(MappingTask(database, photos, hloc / "sparse", config.mapping))
+    verify_database(database, config.verification, px_scale)
+    models = map_incrementally(MappingTask(database, photos, hloc / "sparse", config.mapping, px_scale=px_scale))
 
     result = summarise_models(models, len(images))
     print(f"{result.registered} of {result.num_images} images registered, {result.points} points")

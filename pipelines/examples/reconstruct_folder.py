@@ -52,8 +52,8 @@ def reconstruct_folder(photos: Path, out: Path) -> None:
     # From here on it is COLMAP.
     database = out / "database.db"
     write_database(database, images, cameras, keypoints, matches)
-    verify_database(database, config.verification, max(px_scale.values()))
-    task = MappingTask(database, photos, out / "sparse", config.mapping, config.verification.max_error_px)
+    verify_database(database, config.verification, px_scale)
+    task = MappingTask(database, photos, out / "sparse", config.mapping, config.verification.max_error_px, px_scale)
     models = map_incrementally(task)
 
     result = summarise_models(models, len(images))

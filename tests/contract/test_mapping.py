@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pytest
 
 import hm_sfm.colmap.mapping
 from hm_sfm.colmap.cameras import Cameras
-from hm_sfm.colmap.database import open_database, write_database
+from hm_sfm.colmap.database import open_database, read_verified_matches, write_database
 from hm_sfm.colmap.mapping import MappingTask, map_globally, map_images, map_incrementally, summarise_models
 from hm_sfm.colmap.snapshots import digest_inputs
 from hm_sfm.colmap.verification import is_convincing, verify_database, verify_pair, verify_pairs
@@ -222,6 +223,114 @@ def test_missing_database_is_an_input_error(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+# Photos of other sizes than the matching resolution
+
+
+def add_noise(oracle: Oracle, sigma_px: float) -> Oracle:
+    rng = np.random.default_rng(0)
+    noisy = [
+        dataclasses.replace(points, xy=points.xy + rng.normal(0, sigma_px, points.xy.shape))
+        for points in oracle.keypoints
+    ]
+    return dataclasses.replace(oracle, keypoints=noisy)
+
+
+@dataclass(frozen=True)
+class Result:
+    """Of one run: its models, the inliers of each pair, and what it was given."""
+
+    models: tuple[pycolmap.Reconstruction, ...]
+    inliers: list[int]
+    px_scale: dict[str, float]
+    keypoints: list[Keypoints]
+
+
+def map_scaled(folder: Path, oracle: Oracle, scales: list[float], task: MappingTask, known: bool) -> Result:
+    """The oracle in photos that are `scales` times as large, each with a camera of its own: database, then models."""
+    folder.mkdir(parents=True)
+    images, cameras, keypoints = [], [], []
+    for number, scale in enumerate(scales):
+        camera = make_known_camera(oracle) if known else make_unknown_camera(oracle)
+        camera.camera_id = number + 1
+        camera.width, camera.height = round(camera.width * scale), round(camera.height * scale)
+        camera.params = np.array(camera.params) * [scale, scale, scale, 1.0]
+        cameras.append(camera)
+        images.append(dataclasses.replace(oracle.images[number], size_wh=(camera.width, camera.height)))
+        keypoints.append(dataclasses.replace(oracle.keypoints[number], xy=oracle.keypoints[number].xy * scale))
+    all_cameras = Cameras(tuple(cameras), tuple(range(len(images))), known=known)
+    px_scale = {image.name: scale for image, scale in zip(images, scales)}
+    path = folder / "database.db"
+    write_database(path, images, all_cameras, keypoints, oracle.matches)
+    verify_database(path, VerificationConfig(), px_scale, num_threads=1)
+    task = dataclasses.replace(
+        task, database=path, image_folder=folder, sparse_folder=folder / "sparse", px_scale=px_scale
+    )
+    models = map_images(task, images, all_cameras)
+    with open_database(path) as database:
+        inliers = [len(geometry.inlier_matches) for geometry in database.read_two_view_geometries()[1]]
+    return Result(models, inliers, px_scale, keypoints)
+
+
+@pytest.mark.parametrize("mapper", ["incremental", "global"])
+def test_the_model_does_not_depend_on_the_size_of_the_photos(tmp_path, oracle, mapper):
+    noisy = add_noise(oracle, 0.7)  # of some observations more than the 3 px that are allowed if it counts six times
+    task = MappingTask(tmp_path, tmp_path, tmp_path, MappingConfig(mapper=mapper))
+    expected = map_scaled(tmp_path / "1", noisy, [1.0] * 6, task, known=True)
+    (model,) = expected.models
+    assert model.num_reg_images() == 6
+    for name, scales in {"quarter": [0.25] * 6, "six": [6.0] * 6, "mixed": [1.0, 6.0, 0.25, 1.0, 6.0, 1.0]}.items():
+        result = map_scaled(tmp_path / name, noisy, scales, task, known=True)
+        np.testing.assert_allclose(result.inliers, expected.inliers, atol=1)
+        (scaled,) = result.models
+        assert scaled.compute_num_observations() == pytest.approx(model.compute_num_observations(), rel=0.01)
+        assert scaled.num_points3D() == pytest.approx(model.num_points3D(), abs=2)
+        errors = pycolmap.compare_reconstructions(
+            scaled, model, alignment_error="proj_center", max_proj_center_error=0.05
+        )["errors"]
+        assert len(errors) == 6 and max(error.rotation_error_deg for error in errors) < 0.05
+        if name != "mixed":
+            error_px = scaled.compute_mean_reprojection_error() / scales[0]
+            assert error_px == pytest.approx(model.compute_mean_reprojection_error(), rel=0.02)
+        stored = pycolmap.Reconstruction(tmp_path / name / "sparse" / "0")
+        assert_in_stored_px(stored, result)
+
+
+def assert_in_stored_px(model: pycolmap.Reconstruction, result: Result) -> None:
+    """Keypoints to the last bit, and cameras that project the points onto them."""
+    xy_of = {points.name: points.xy for points in result.keypoints}
+    for image in model.images.values():
+        xy = np.array([point.xy for point in image.points2D])
+        np.testing.assert_array_equal(xy, xy_of[image.name])
+        seen = image.get_observation_points2D()
+        projected = np.array([image.project_point(model.points3D[point.point3D_id].xyz) for point in seen])
+        distance_px = np.linalg.norm(projected - [point.xy for point in seen], axis=1)
+        assert np.median(distance_px) < 1.5 * result.px_scale[image.name]
+
+
+def test_unknown_intrinsics_and_colours_of_large_photos(tmp_path, oracle, monkeypatch):
+    # Photos of a quarter of the size, to save time: their left half is red, their right half blue.
+    pixels = np.zeros((192, 256, 3), np.uint8)
+    pixels[:, :128, 0], pixels[:, 128:, 2] = 255, 255
+    folder = tmp_path / "run"
+    task = MappingTask(tmp_path, tmp_path, tmp_path)
+    for image in oracle.images:
+        pycolmap.Bitmap.from_array(pixels).write(tmp_path / image.name)
+    monkeypatch.setattr(hm_sfm.colmap.mapping, "open_to_colmap", lambda images, _: nullcontext(tmp_path))
+    result = map_scaled(folder, oracle, [0.25] * 6, task, known=False)
+    (model,) = result.models
+    true = next(iter(oracle.model.cameras.values())).params
+    for camera in model.cameras.values():
+        assert (camera.width, camera.height) == (256, 192)
+        np.testing.assert_allclose(camera.params, np.array(true) * [0.25, 0.25, 0.25, 1.0], rtol=1e-2)
+    shares = []
+    for point in model.points3D.values():
+        x = np.array([model.images[seen.image_id].points2D[seen.point2D_idx].xy[0] for seen in point.track.elements])
+        if np.all(np.abs(x - 128) > 2):
+            shares.append(np.mean(x < 128))
+            np.testing.assert_allclose(point.color, (255 * shares[-1], 0, 255 * (1 - shares[-1])), atol=1)
+    assert len(shares) > 50 and len(set(shares)) > 2
+
+
 # Snapshots
 
 KILLED_MAPPING = """
@@ -426,6 +535,53 @@ def test_verification_replaces_earlier_geometries_and_drops_planted_outliers(tmp
     assert map_incrementally(MappingTask(path, tmp_path, tmp_path / "sparse", fix_intrinsics=True)) == ()
 
 
+def test_a_large_photo_does_not_loosen_the_limits_of_other_pairs(tmp_path):
+    pair, camera, right = make_pair(300, 0.3, True)
+    camera.camera_id = 1
+    xy0, xy1 = pair.xy0, pair.xy1.copy()
+    xy1[~right] = xy1[~right] + np.random.default_rng(1).choice([-1, 1], ((~right).sum(), 2)) * [7.0, 9.0]
+    images = [ImageRef(name, Path(name), SIZE_WH) for name in ("a.jpg", "b.jpg", "large.jpg")]
+    keypoints = [
+        Keypoints(image.name, xy, np.ones(len(xy)), np.ones(len(xy)))
+        for image, xy in zip(images, (xy0, xy1, np.zeros((0, 2))))
+    ]
+    matches = IndexMatches(pair.pair, np.repeat(np.arange(300)[:, None], 2, axis=1), np.ones(300))
+    path = tmp_path / "database.db"
+    write_database(path, images, Cameras((camera,), (0, 0, 0)), keypoints, [matches])
+    verify_database(path, VerificationConfig(), num_threads=1)
+    (expected,) = read_verified_matches(path).values()
+    verify_database(path, VerificationConfig(), {"a.jpg": 1.0, "b.jpg": 1.0, "large.jpg": 30.0}, num_threads=1)
+    (inliers,) = read_verified_matches(path).values()
+    np.testing.assert_array_equal(inliers, expected)
+    assert len(expected) == pytest.approx(right.sum(), abs=6)
+
+
+@pytest.mark.parametrize("prior", [True, False], ids=["calibrated", "uncalibrated"])
+def test_a_dominant_plane_keeps_what_stands_before_it_in_the_database(tmp_path, prior):
+    both, camera = make_facade(prior)
+    camera.camera_id = 1
+    images = [ImageRef(name, Path(name), SIZE_WH) for name in ("a.jpg", "b.jpg")]
+    count = len(both)
+    keypoints = [
+        Keypoints(image.name, xy, np.ones(count), np.ones(count)) for image, xy in zip(images, (both.xy0, both.xy1))
+    ]
+    matches = IndexMatches(both.pair, np.repeat(np.arange(count)[:, None], 2, axis=1), np.ones(count))
+    path = tmp_path / "database.db"
+    write_database(path, images, Cameras((camera,), (0, 0)), keypoints, [matches])
+    for px_scale in ({}, dict.fromkeys(("a.jpg", "b.jpg"), 1.5)):
+        verify_database(path, VerificationConfig(max_error_px=2.0), px_scale, num_threads=1)
+        (inliers,) = read_verified_matches(path).values()
+        assert len(inliers) >= 0.99 * count
+        with open_database(path) as database:
+            (stored,) = database.read_two_view_geometries()[1]
+            assert database.read_all_cameras()[0].has_prior_focal_length == prior
+        # F and H are px of the stored photos again.
+        homogeneous = np.column_stack([both.xy0, np.ones(count)]) @ stored.H.T
+        distance_px = np.linalg.norm(homogeneous[:400, :2] / homogeneous[:400, 2:] - both.xy1[:400], axis=1)
+        assert np.median(distance_px) < 1.0
+    assert [entry.name for entry in tmp_path.iterdir()] == ["database.db"]
+
+
 def test_track_length_counts_distinct_images(oracle):
     model = pycolmap.Reconstruction(oracle.model)
     before = summarise_models([model], 6)
@@ -495,11 +651,22 @@ def test_planted_outliers_are_rejected(num_matches, shape, prior):
     np.testing.assert_array_equal(mask, verify_pair(pair, camera, camera, VerificationConfig()))
 
 
-def test_a_dominant_plane_does_not_cost_what_stands_before_it():
-    planar, camera, _ = make_pair(400, 0.0, True, "planar")
-    deep, _, _ = make_pair(40, 0.0, True, "deep")
-    both = make_matches(np.concatenate([planar.xy0, deep.xy0]), np.concatenate([planar.xy1, deep.xy1]))
-    assert verify_pair(both, camera, camera, VerificationConfig(max_error_px=1.0)).all()
+def make_facade(prior: bool) -> tuple[PairMatches, pycolmap.Camera]:
+    """400 matches on a plane, then 40 before it. Without a prior, the focal length of the camera is a wrong guess."""
+    planar, camera, _ = make_pair(400, 0.0, prior, "planar")
+    deep, _, _ = make_pair(40, 0.0, prior, "deep")
+    if not prior:
+        camera.params = [1.4 * 1000.0, 512.0, 384.0, 0.0]
+    return make_matches(np.concatenate([planar.xy0, deep.xy0]), np.concatenate([planar.xy1, deep.xy1])), camera
+
+
+@pytest.mark.parametrize("prior", [True, False], ids=["calibrated", "uncalibrated"])
+def test_a_dominant_plane_does_not_cost_what_stands_before_it(prior):
+    both, camera = make_facade(prior)
+    max_error_px = 1.0 if prior else 2.0  # the lens is distorted, and only the first camera knows
+    inliers = verify_pair(both, camera, camera, VerificationConfig(max_error_px=max_error_px))
+    assert inliers[:400].mean() >= 0.99 and inliers[400:].mean() >= 0.95
+    assert inliers.all() or not prior
 
 
 def test_pairs_below_the_limits_are_rejected():

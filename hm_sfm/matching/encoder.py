@@ -14,9 +14,7 @@ from hm_sfm.network.homonet import HomoNet
 from hm_sfm.photos.images import PreparedImage
 
 STRIP_PX = 1024
-"""encode_fine takes large photos in strips of so many rows, to bound the memory,"""
-MARGIN_PX = 128
-"""with so many more on each side as the network looks around. Both are multiples of any backbone's stride."""
+"""encode_fine takes photos in strips of so many rows, to bound the memory; a multiple of any backbone's stride."""
 
 
 class Encoder:
@@ -61,14 +59,19 @@ class Encoder:
 
     @torch.inference_mode()
     def encode_fine(self, image: PreparedImage) -> FineMap:
-        """The fine features alone, strip by strip: what the backbone makes of the whole, but for the last digits."""
+        """The fine features alone: what the backbone makes of the whole, but for the last digits.
+
+        Strip by strip, each with the rows around it that its features see, where the backbone looks only so far.
+        """
         pixels = self._pad(image)
-        stride, height = self.net.backbone.fine_grid.stride, pixels.shape[2]
+        backbone, height = self.net.backbone, pixels.shape[2]
+        stride, reach_px = backbone.fine_grid.stride, backbone.reach_px
+        strip_px = height if reach_px is None else STRIP_PX
         strips = []
-        for top in range(0, height, STRIP_PX):
-            first, last = max(0, top - MARGIN_PX), min(height, top + STRIP_PX + MARGIN_PX)
+        for top in range(0, height, strip_px):
+            bottom = min(height, top + strip_px)
+            first, last = max(0, top - (reach_px or 0)), min(height, bottom + (reach_px or 0))
             fine = require_fine(self._run_backbone(pixels[:, :, first:last]))
-            bottom = min(height, top + STRIP_PX)
             strips.append(fine[:, :, (top - first) // stride : (bottom - first) // stride])
         return make_fine_map(torch.cat(strips, dim=2))
 

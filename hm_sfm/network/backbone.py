@@ -94,6 +94,8 @@ class LightBackbone(nn.Module):
     """Images are padded right and bottom to a multiple of this."""
     standardised = True
     """Images come with zero mean and unit variance; otherwise in [0, 1]."""
+    reach_px: int | None = 224
+    """No feature depends on pixels farther away than this, along either axis; a multiple of `stride`."""
     coarse_grid = Grid(stride=8, offset=4.0)
     fine_grid = Grid(stride=2, offset=1.0)
     fine_channels = 48

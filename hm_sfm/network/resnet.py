@@ -38,6 +38,8 @@ class LoftrBackbone(nn.Module):
 
     stride = 8
     standardised = False
+    reach_px: int | None = None
+    """Maps are enlarged with their corners aligned: where a cell looks depends on the size of the whole image."""
     coarse_grid = Grid(stride=8, offset=0.5)
     fine_grid = Grid(stride=2, offset=0.5)
     fine_channels = WIDTHS[0]

@@ -18,7 +18,7 @@ from hm_sfm.keypoints.refinement import KeypointRefiner
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.matching.store import MatchStore, digest_image
 from hm_sfm.network.fine import ExpectationHead
-from hm_sfm.photos.images import prepare_image, read_ref
+from hm_sfm.photos.images import read_ref
 
 SIZE_WH = (768, 576)
 PX_SCALE = 3.0
@@ -183,16 +183,6 @@ def test_what_was_done_is_not_done_again_and_other_edges_are(photos, matcher, tm
     assert len(encoded) == 2
     refine(connect_photos(photos, wrong=5), photos, matcher, tmp_path, {"weights": "others"})
     assert len(encoded) == 4
-
-
-def test_strips_make_the_features_of_the_whole(photos, matcher, monkeypatch):
-    image = prepare_image(photos[0], SIZE_WH[0])
-    whole = matcher.encoder.encode_fine(image)
-    monkeypatch.setattr("hm_sfm.matching.encoder.STRIP_PX", 512)
-    strips = matcher.encoder.encode_fine(image)
-    assert strips.size_wh == whole.size_wh == (SIZE_WH[0] // 2, SIZE_WH[1] // 2)
-    off = (strips.cells - whole.cells).abs().float()
-    assert off.mean() < 0.01 * whole.cells.abs().float().mean()
 
 
 @pytest.mark.parametrize("rotation_deg", [0, 90, 180, 270])

@@ -18,7 +18,8 @@ COLUMNS = 3
 def draw_curves(log: Path, validation: Path, path: Path) -> None:
     """Write a PNG of the parts of the loss, smoothed, the learning rate, and each score of the validation; atomic.
 
-    validation may not exist yet. Raises MissingPackageError without matplotlib.
+    Scores such as right@0.2 and right@0.4 share a panel. validation may not exist yet. Raises MissingPackageError
+    without matplotlib.
     """
     try:
         from matplotlib.figure import Figure
@@ -28,8 +29,11 @@ def draw_curves(log: Path, validation: Path, path: Path) -> None:
         ) from error
     logged = read_columns(log)
     scores = read_columns(validation) if validation.exists() else {"step": np.zeros(0)}
-    names = [name for name in scores if name != "step"]
-    rows = -(-(2 + len(names)) // COLUMNS)
+    panels: dict[str, list[str]] = {}
+    for name in scores:
+        if name != "step":
+            panels.setdefault(name.partition("@")[0], []).append(name)
+    rows = -(-(2 + len(panels)) // COLUMNS)
     figure = Figure(figsize=(5 * COLUMNS, 3.2 * rows), layout="constrained")
     axes = figure.subplots(rows, COLUMNS, squeeze=False).flatten()
     for name in logged:
@@ -39,13 +43,16 @@ def draw_curves(log: Path, validation: Path, path: Path) -> None:
     axes[0].set_title("loss and its parts")
     axes[1].plot(logged["step"], logged["rate"])
     axes[1].set_title("learning rate")
-    for panel, name in zip(axes[2:], names):
-        panel.plot(scores["step"], scores[name], marker="o", markersize=3)
-        panel.set_title(f"held-out pairs: {name}")
-    for panel in axes[: 2 + len(names)]:
+    for panel, (title, names) in zip(axes[2:], panels.items()):
+        for name in names:
+            panel.plot(scores["step"], scores[name], marker="o", markersize=3, label=name)
+        panel.set_title(f"held-out pairs: {title}")
+        if len(names) > 1:
+            panel.legend(fontsize="small")
+    for panel in axes[: 2 + len(panels)]:
         panel.set_xlabel("step")
         panel.grid(alpha=0.3)
-    for panel in axes[2 + len(names) :]:
+    for panel in axes[2 + len(panels) :]:
         panel.remove()
     with replace_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=100)

@@ -70,16 +70,17 @@ def measure_loss(
 def measure_point_loss(estimates: list[FineEstimate], supervision: PointSupervision, half: float) -> Tensor:
     """The loss of patches of which one pair of points is known, a scalar.
 
-    It is the error beyond TEACHER_ERROR, where the estimate is regular, and that of the error scale, weighted as in
-    measure_loss.
+    It is the error beyond TEACHER_ERROR, where the estimate is regular, and that of the error scale, which is told the
+    whole error, weighted as in measure_loss.
     """
     count = supervision.correct.sum().clamp_min(1)
     total = supervision.point0.new_zeros(())
     for age, estimate in enumerate(reversed(estimates)):
         moved = apply_homography(estimate.homography, supervision.point0[:, None])[:, 0]
-        error = ((moved - supervision.point1).norm(dim=-1) - TEACHER_ERROR).clamp_min(0)
+        whole = (moved - supervision.point1).norm(dim=-1)
+        error = (whole - TEACHER_ERROR).clamp_min(0)
         regular = supervision.correct & is_regular(estimate.homography.detach(), half)
-        known = torch.where(supervision.correct, error.detach(), LARGEST_ERROR).clamp(0.02, LARGEST_ERROR)
+        known = torch.where(supervision.correct, whole.detach(), LARGEST_ERROR).clamp(0.02, LARGEST_ERROR)
         likelihood = estimate.log_scale + known * torch.exp(-estimate.log_scale)
         dense = torch.where(regular, error, 0.0).sum() / count / half
         total = total + DISCOUNT**age * (dense + SCALE_WEIGHT * likelihood.sum() / max(len(known), 1))

@@ -49,6 +49,16 @@ def test_losses_learning_rate_and_scores_are_drawn(files, drawn):
     assert sorted(p.name for p in path.parent.iterdir()) == ["curves.png", "log.csv", "validation.csv"]
 
 
+def test_scores_of_one_kind_share_a_panel(files, drawn):
+    """And a bin without a match leaves a gap."""
+    log, validation, path = files
+    append_row(validation, {"step": 2, "right@0.2": 30.0, "median_px": 0.8, "right@0.4": float("nan")})
+    draw_curves(log, validation, path)
+    _, _, right, error = drawn[0].axes
+    assert [line.get_label() for line in right.get_lines()] == ["right@0.2", "right@0.4"]
+    assert right.get_title() == "held-out pairs: right" and error.get_title() == "held-out pairs: median_px"
+
+
 def test_before_the_first_validation_there_are_losses_only(files, drawn):
     draw_curves(*files)
     assert files[2].exists() and len(drawn[0].axes) == 2

@@ -326,6 +326,7 @@ def test_patches_are_supervised_by_the_blocks(folders):
     supervision = draw_patches(
         torch.tensor(b_from_a)[None],
         torch.tensor(surface)[None],
+        torch.ones(1, 2, 1, 20, 20),
         400,
         LightBackbone.coarse_grid,
         fine,

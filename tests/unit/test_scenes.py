@@ -280,7 +280,8 @@ def test_patches_of_scenes_follow_their_own_surface(photos):
     item = RenderedScenes(photos, (96, 96), 7, 10, views)[2]
     b_from_a, surface = torch.tensor(item["b_from_a"])[None], torch.tensor(item["surface"])[None]
     coarse, fine = LightBackbone.coarse_grid, LightBackbone.fine_grid
-    supervision = draw_patches(b_from_a, surface, 600, coarse, fine, 4.0, torch.Generator().manual_seed(0))
+    features, generator = torch.ones(1, 2, 1, 12, 12), torch.Generator().manual_seed(0)
+    supervision = draw_patches(b_from_a, surface, features, 600, coarse, fine, 4.0, generator)
     assert supervision.correct.sum() > 50
     for i in supervision.correct.nonzero().flatten().tolist()[:40]:
         # The patch centre is one px right of and below the coarse cell's centre, which is what must be shown.

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from hm_sfm.colmap.database import write_database
 from hm_sfm.colmap.mapping import MappingTask, map_images
+from hm_sfm.colmap.overlays import Overlays, find_overlays
 from hm_sfm.colmap.verification import VerifiedPair, rank_pairs, verify_database, verify_pairs
 from hm_sfm.config import Config
 from hm_sfm.keypoints.graph import Photo
@@ -80,8 +81,18 @@ class Run:
         self.timings.add(dataclasses.asdict(times))
 
     def read(self, pair: ImagePair) -> PairMatches:
-        """The matches of a pair that are not masked. Raises KeyError where it is not matched."""
+        """The matches of a pair that are neither masked nor on an overlay. Raises KeyError if some are not matched."""
+        return self._overlays.drop_still(self._read_unmasked(pair))
+
+    def _read_unmasked(self, pair: ImagePair) -> PairMatches:
         return self.collection.masks.drop_hidden(self.store.read(pair))
+
+    @cached_property
+    def _overlays(self) -> Overlays:
+        px_scales = measure_px_scales(self.images, self.config)
+        return find_overlays(
+            self.images, self.pairs, self._read_unmasked, px_scales, self.config.verification.min_score
+        )
 
     def make_keypoints(
         self, seeds: Mapping[str, np.ndarray] | None = None

@@ -10,6 +10,7 @@ import pycolmap
 
 from hm_sfm.colmap.cameras import Cameras
 from hm_sfm.colmap.database import open_database, read_verified_matches
+from hm_sfm.colmap.overlays import STILL_PX, measure_moves
 from hm_sfm.config import Config
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
@@ -43,16 +44,17 @@ ALL_PAIRS = "--pairs exhaustive"
 LARGER = "--set images.long_edge_px=1600"
 INTRINSICS = "known intrinsics: --camera-model and --camera-params"
 OWN_CAMERAS = "--camera-mode per-image"
+MASKS = "masks (--masks or --camera-mask) of what stays where it is in the frame"
 ADVICE = {
     Cause.UNPAIRED: (ALL_PAIRS,),
     Cause.FEW_MATCHES: (BETWEEN, ALL_PAIRS, LARGER),
-    Cause.DISAGREEING: (BETWEEN, ALL_PAIRS, LARGER),
-    Cause.OTHER_MODEL: (BETWEEN, ALL_PAIRS),
-    Cause.APART: (BETWEEN, ALL_PAIRS),
-    Cause.FEW_POINTS: (BETWEEN, ALL_PAIRS, LARGER),
-    Cause.NO_POSE: (INTRINSICS, OWN_CAMERAS),
-    Cause.SMALL_BASELINE: (FARTHER, INTRINSICS),
-    Cause.NO_START: (BETWEEN, INTRINSICS, LARGER),
+    Cause.DISAGREEING: (MASKS, BETWEEN, ALL_PAIRS, LARGER),
+    Cause.OTHER_MODEL: (MASKS, BETWEEN, ALL_PAIRS),
+    Cause.APART: (MASKS, BETWEEN, ALL_PAIRS),
+    Cause.FEW_POINTS: (MASKS, BETWEEN, ALL_PAIRS, LARGER),
+    Cause.NO_POSE: (MASKS, INTRINSICS, OWN_CAMERAS),
+    Cause.SMALL_BASELINE: (FARTHER, MASKS, INTRINSICS),
+    Cause.NO_START: (MASKS, BETWEEN, INTRINSICS, LARGER),
 }
 """What to try, the most promising first; choose_advice leaves out what is already the case."""
 
@@ -100,6 +102,22 @@ class Evidence:
             if name in (pair.name0, pair.name1):
                 keypoints_of[pair.name1 if name == pair.name0 else pair.name0] = matches[:, int(name == pair.name1)]
         return dict(sorted(keypoints_of.items(), key=lambda item: (-len(item[1]), item[0])))
+
+    def stays_still(self, name: str) -> bool:
+        """Whether most matches of most of an image's pairs stay where they are in the frame.
+
+        Photos from one place do that, and also those of an object that turns before a camera that does not move.
+        """
+        checks, long_edge_px = self.config.verification, self.config.images.long_edge_px
+        px_scale = {image.name: max(1.0, max(image.size_wh) / long_edge_px) for image in self.images.values()}
+        still = []
+        for pair in self.pairs:
+            if name in (pair.name0, pair.name1):
+                matches = self.read(pair)
+                _, moved_px = measure_moves(matches.select(matches.score >= checks.min_score), px_scale)
+                if len(moved_px) >= checks.min_inliers:
+                    still.append(np.mean(moved_px <= STILL_PX) > 0.5)
+        return bool(still) and float(np.mean(still)) > 0.5
 
 
 def diagnose(
@@ -225,6 +243,7 @@ def choose_advice(cause: Cause, names: Sequence[str], evidence: Evidence) -> tup
         LARGER: max(max(evidence.images[name].size_wh) for name in names) <= config.images.long_edge_px
         or config.images.long_edge_px >= 1600,
         INTRINSICS: all(evidence.focal_known[name] for name in names),
+        MASKS: not any(evidence.stays_still(name) for name in names),
         OWN_CAMERAS: config.cameras.mode == "per-image" or bool(config.cameras.rig),
     }
     return tuple(advice for advice in ADVICE[cause] if not useless.get(advice, False))

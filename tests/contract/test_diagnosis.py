@@ -35,6 +35,8 @@ class Run:
         self.pairs = pair_exhaustively(self.names)
         self.scores: dict[ImagePair, int] = {}
         """Pair -> its number of good matches."""
+        self.moves_px = 90.0
+        """By which matches move, px of the photos of 4000 x 3000 px."""
         self.models = [self.model]
         self.config = Config()
 
@@ -44,7 +46,8 @@ class Run:
         score = np.r_[np.full(good, 0.9), np.full(5, 0.1)]
         xy = np.zeros((count, 2))
         homography = np.tile(np.eye(3), (count, 1, 1))
-        return PairMatches(pair=pair, xy0=xy, xy1=xy, score=score, homography=homography, patch_radius_px=8.0)
+        xy1 = xy + self.moves_px
+        return PairMatches(pair=pair, xy0=xy, xy1=xy1, score=score, homography=homography, patch_radius_px=8.0)
 
     def deregister(self, name: str) -> None:
         self.model.deregister_frame(self.model.image(self.ids[name]).frame_id)
@@ -107,6 +110,16 @@ def test_matches_that_disagree(run):
     )
 
 
+def test_masks_are_advised_where_matches_stay_in_their_places(run):
+    """As those of a still background do, before which an object turns."""
+    run.models = []
+    run.scores = dict.fromkeys(run.pairs, 50)
+    (moving,) = run.diagnose()
+    run.moves_px = 2.0  # half a px of the matching resolution
+    (still,) = run.diagnose()
+    assert still.advice == ("masks (--masks or --camera-mask) of what stays where it is in the frame", *moving.advice)
+
+
 def test_an_image_of_another_model(run):
     whole = pycolmap.Reconstruction(run.model)
     run.deregister(run.names[2])
@@ -163,10 +176,12 @@ def test_the_same_view_twice_has_no_baseline(tmp_path):
     path = tmp_path / "database.db"
     write_database(path, images, cameras, keypoints, [matches])
     verify_database(path, VerificationConfig(), num_threads=1)
-    (diagnosis,) = diagnose(images, cameras, [pair], Run.read, path, (), Config())
+    homography = np.tile(np.eye(3), (200, 1, 1))
+    still = PairMatches(pair=pair, xy0=xy, xy1=xy, score=np.ones(200), homography=homography, patch_radius_px=8.0)
+    (diagnosis,) = diagnose(images, cameras, [pair], lambda pair: still, path, (), Config())
     assert diagnosis.cause == Cause.SMALL_BASELINE
     assert diagnosis.reasons["a.jpg"] == "rays meet at 0.0 degrees at most, focal length unknown"
-    assert diagnosis.advice[0] == "photos from places farther apart"
+    assert diagnosis.advice[0] == "photos from places farther apart" and diagnosis.advice[1].startswith("masks ")
 
 
 def test_long_lists_are_cut():

@@ -51,6 +51,15 @@ def test_every_configuration_parses(path):
     assert isinstance(load_config(path, cls=cls), cls)
 
 
+@pytest.mark.parametrize("name", ["loftr", "loftr_homo", "loftr_homo_heavy", "aspan_homo", "aspan_homo_heavy"])
+def test_the_papers_configurations_have_what_the_paper_has_and_no_more(name):
+    config = load_config(CONFIGS / f"{name}.yaml")
+    assert config.network.backbone == "loftr" and (config.network.margin, config.network.spacing) == (0, 1)
+    assert config.matching.grow_below == 0 and not config.matching.try_hypotheses
+    assert config.keypoints.refine_long_edge_px == 0
+    assert (config.images.long_edge_px, config.matching.min_confidence) == (840, 0.2)
+
+
 def test_keys_that_are_left_out_keep_their_defaults(tmp_path):
     config = load_config(write(tmp_path / "c.yaml", "keypoints: {separation_px: 3}\nnetwork:\n"))
     assert config == dataclasses.replace(Config(), keypoints=KeypointConfig(separation_px=3.0))

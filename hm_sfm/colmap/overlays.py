@@ -8,7 +8,7 @@ stay where they are. So the collection is asked: an overlay is where matches sta
 import logging
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,15 +33,16 @@ LEAST_SHARE = 0.25
 class Overlays:
     """Where the photos of a collection have overlays."""
 
-    frame_of: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    frame_of: Mapping[str, tuple[int, int]]
     """Image name -> size of the photo at the matching resolution: photos of one size have one frame."""
-    cells: Mapping[tuple[int, int], np.ndarray] = field(default_factory=dict)
+    cells: Mapping[tuple[int, int], np.ndarray]
     """Frame -> (rows, columns) bool, of the frames that have an overlay."""
-    px_scale: Mapping[str, float] = field(default_factory=dict)
+    px_scale: Mapping[str, float]
+    """Image name -> px of the stored image per px of the matching resolution."""
 
     def drop_still(self, matches: PairMatches) -> PairMatches:
         """The matches without those that stay in their place on an overlay."""
-        frame = self.frame_of.get(matches.pair.name0)
+        frame = self.frame_of[matches.pair.name0]
         if frame not in self.cells or self.frame_of[matches.pair.name1] != frame:
             return matches
         xy0, moved_px = measure_moves(matches, self.px_scale)

@@ -18,6 +18,9 @@ from hm_sfm.types import ImageRef
 # The first guess of a focal length that nothing is known about, relative to the longer side. COLMAP's 1.2 is too long
 # for most phones and videos, which have 0.5 to 1.1: adjustment of a flat scene may then run off to a telephoto lens.
 DEFAULT_FOCAL_RATIO = 0.9
+# For fisheye lenses, whose pixels are angles: the longer side then spans 140 degrees. No lens is so long that its view
+# is like that of others, and from 180 to 100 degrees adjustment finds the right one.
+DEFAULT_FISHEYE_RATIO = 0.41
 
 
 @dataclass(frozen=True)
@@ -170,11 +173,17 @@ def _read_exif_focal(image: ImageRef) -> _ExifFocal:
     return _ExifFocal(bitmap.exif_focal_length(), read_camera_label(bitmap))
 
 
+def guess_focal_px(model: pycolmap.CameraModelId, size_wh: tuple[int, int]) -> float:
+    """The first guess of a focal length that nothing is known about, for photos of this size."""
+    is_fisheye = pycolmap.Camera.create_from_model_id(1, model, 1.0, *size_wh).is_perspective_fisheye()
+    return (DEFAULT_FISHEYE_RATIO if is_fisheye else DEFAULT_FOCAL_RATIO) * max(size_wh)
+
+
 def _make_camera(
     camera_id: int, model: pycolmap.CameraModelId, size_wh: tuple[int, int], focal_px: float | None
 ) -> pycolmap.Camera:
     camera = pycolmap.Camera.create_from_model_id(
-        camera_id, model, focal_px or DEFAULT_FOCAL_RATIO * max(size_wh), *size_wh
+        camera_id, model, focal_px or guess_focal_px(model, size_wh), *size_wh
     )
     camera.has_prior_focal_length = focal_px is not None
     return camera

@@ -9,21 +9,24 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from hm_sfm.colmap.cameras import Cameras
 from hm_sfm.colmap.database import open_database
+from hm_sfm.colmap.mapping_attempts import build_scaled, find_models, sort_models
+from hm_sfm.colmap.mapping_task import MappingTask
 from hm_sfm.colmap.rigs import lack_poses
-from hm_sfm.colmap.scaled_database import copy_scaled, needs_scaling, restore_px
+from hm_sfm.colmap.scaled_database import needs_scaling
 from hm_sfm.colmap.snapshots import SNAPSHOT_FOLDER, Snapshots, digest_inputs
-from hm_sfm.config import MappingConfig, VerificationConfig
 from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.photos.bitmaps import open_to_colmap
 from hm_sfm.types import ImageRef, MappingResult
@@ -44,29 +47,6 @@ LOCAL_REFINEMENTS = 1
 # Images, or frames of rigs, that a model gains from one snapshot to the next: mapping them takes longer by far than
 # writing it.
 SNAPSHOT_IMAGES = 20
-
-
-@dataclass(frozen=True)
-class MappingTask:
-    """A verified database to build models from, and how."""
-
-    database: Path
-    image_folder: Path
-    """For the colours of the points."""
-    sparse_folder: Path
-    """The models go to its subfolders 0, 1, ..., as COLMAP binary; what it held before is gone then."""
-    config: MappingConfig = field(default_factory=MappingConfig)
-    max_error_px: float = VerificationConfig().max_error_px
-    """Px of the matching resolution: observations farther than this from their point are dropped. COLMAP's own 4 px are
-    meant for keypoints that are less exact. Calibration before global mapping allows the same error in photos of 1000
-    px, and as much more as photos are larger."""
-    px_scale: Mapping[str, float] = field(default_factory=dict)
-    """By image name, px of the stored image per px of the matching resolution; 1 where it is left out. All limits of
-    the mappers that count px count them at the matching resolution."""
-    fix_intrinsics: bool = False
-    """Keep all cameras as the database has them."""
-    on_image: Callable[[], object] | None = None
-    """Called once per registered image, of a rig once per frame."""
 
 
 def map_images(task: MappingTask, images: Sequence[ImageRef], cameras: Cameras) -> tuple[pycolmap.Reconstruction, ...]:
@@ -124,7 +104,11 @@ def calibrate_rigs(task: MappingTask, rigs: Sequence[pycolmap.RigConfig]) -> boo
 def map_incrementally(task: MappingTask) -> tuple[pycolmap.Reconstruction, ...]:
     """Build models from a verified database with COLMAP's incremental mapper, then adjust and filter each of them.
 
-    The mapper may register an image again in another model or attempt: on_image is called again, too.
+    The mapper may register an image again in another model or attempt: on_image is called again, too. Unless the
+    intrinsics are fixed, the models are judged, and where they cannot be right, other first guesses of the cameras are
+    tried: the best is kept, the database gets its cameras, and a warning is logged, as also where the photos do not
+    determine the focal length. Models with impossible cameras are left out. Two photos that are joined to no others
+    have a model, too.
 
     While a model grows, the folder `snapshots` beside the sparse folder holds its newest snapshot. The same call goes
     on from there after it was killed; snapshots of another database or configuration are not used.
@@ -132,21 +116,21 @@ def map_incrementally(task: MappingTask) -> tuple[pycolmap.Reconstruction, ...]:
     Returns the models, most registered images first, then most points; the sparse folder has them in this order.
     Without a model there is no folder. Raises InputError where there is no database.
     """
-    return _write_models(task, _run_mapper)
+    return _write_models(task, partial(find_models, task, _run_mapper, _map_leftovers))
 
 
 def map_globally(task: MappingTask) -> tuple[pycolmap.Reconstruction, ...]:
     """As map_incrementally, with COLMAP's global mapper: the rotations of all images, then all positions and points.
 
     Focal lengths that nothing is known about are estimated first, from all pairs together; where that does not lead to
-    a model of all images, the guess of make_cameras is tried, too. The database stays as it is. on_image is called when
-    all is done. The global mapper cannot be interrupted.
+    a model of all images, the guess of make_cameras is tried, too. on_image is called when all is done. The global
+    mapper cannot be interrupted.
 
     It needs matches that are one to one and tracks with one keypoint per image, which IndexMatches and
     persist_keypoints guarantee: it stops at a match that occurs twice, and drops tracks whose observations in one image
     are more than 10 px apart.
     """
-    return _write_models(task, _run_global_mapper)
+    return _write_models(task, partial(find_models, task, _run_global_mapper, _map_leftovers))
 
 
 def triangulate_images(
@@ -159,15 +143,14 @@ def triangulate_images(
     Returns one model with all images, or none where there are no points; the sparse folder is as map_incrementally
     leaves it. Raises InputError where there is no database.
     """
-    return _write_models(replace(task, fix_intrinsics=True), partial(_run_triangulator, images, cameras))
+    known = replace(task, fix_intrinsics=True)
+    return _write_models(task, partial(build_scaled, known, partial(_run_triangulator, images, cameras)))
 
 
 def _write_models(
-    task: MappingTask, build: Callable[[MappingTask, Path], list[pycolmap.Reconstruction]]
+    task: MappingTask, find: Callable[[Path], list[pycolmap.Reconstruction]]
 ) -> tuple[pycolmap.Reconstruction, ...]:
-    """Sort the models that `build` makes, and put them in the sparse folder's place.
-
-    build: is given the task, with a database in px of the matching resolution, and a new folder to work in.
+    """Sort the models that `find` makes, given a folder to work in, and put them in the sparse folder's place.
 
     Snapshots of them are then removed, and so is what killed processes left. Without verified matches there is nothing
     to build. Raises InputError where there is no database.
@@ -179,12 +162,10 @@ def _write_models(
     with _make_work_folder(sparse_folder.parent, f".{sparse_folder.name}.") as work_folder:
         models: list[pycolmap.Reconstruction] = []
         if can_map:
-            raw = work_folder / "mapper"
-            raw.mkdir()
             # The one error that COLMAP logs here is that there is no model, which the caller is told anyway.
             with quiet_colmap(pycolmap.logging.FATAL):
-                models = _build_scaled(task, build, raw)
-        models.sort(key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
+                models = find(work_folder)
+        sort_models(models)
 
         finished = work_folder / "sparse"
         for number, model in enumerate(models):
@@ -199,21 +180,6 @@ def _write_models(
         if snapshots.exists():  # all of them at once: none is left with files missing
             os.replace(snapshots, work_folder / "snapshots")
     return tuple(models)
-
-
-def _build_scaled(
-    task: MappingTask, build: Callable[[MappingTask, Path], list[pycolmap.Reconstruction]], folder: Path
-) -> list[pycolmap.Reconstruction]:
-    """What `build` makes of the database in px of the matching resolution, in px of the stored photos."""
-    if not needs_scaling(task.px_scale):
-        return build(task, folder)
-    scaled = folder.with_name("scaled.db")
-    copy_scaled(task.database, scaled, task.px_scale)
-    models = build(replace(task, database=scaled), folder)
-    for model in models:
-        restore_px(model, task.database, task.px_scale, task.fix_intrinsics)
-        model.extract_colors_for_all_images(task.image_folder)
-    return models
 
 
 @contextmanager
@@ -254,6 +220,41 @@ def _run_mapper(task: MappingTask, output_folder: Path) -> list[pycolmap.Reconst
     for model in models.values():
         _adjust(model, options)
     return list(models.values())
+
+
+def _map_leftovers(registered: set[int], task: MappingTask, output_folder: Path) -> list[pycolmap.Reconstruction]:
+    """Models of the photos that verified pairs join to each other, but to no registered one.
+
+    Of these, the matches of just two photos count as well. COLMAP leaves them out, because they are less reliable than
+    those that a third photo confirms: where there is no third photo, it never has a model.
+    """
+    with open_database(task.database) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        pair_ids, counts = database.read_two_view_geometry_num_inliers()
+    pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id, count in zip(pair_ids, counts) if count]
+    if registered.issuperset(image_id for pair in pairs for image_id in pair):
+        return []
+    count = max(names) + 1
+    edges = coo_array((np.ones(len(pairs)), tuple(np.array(pairs).T)), shape=(count, count))
+    _, group = connected_components(edges, directed=False)
+    mapped = {group[image_id] for image_id in registered}
+    left = sorted({image_id for pair in pairs for image_id in pair if group[image_id] not in mapped})
+    if not left:
+        return []
+    options = _pipeline_options(task)
+    options.triangulation.ignore_two_view_tracks = False
+    options.image_names = [names[image_id] for image_id in left]
+    found = pycolmap.incremental_mapping(
+        task.database,
+        task.image_folder,
+        output_folder,
+        options,
+        initial_image_pair_callback=lambda: _report_images(2, task.on_image),
+        next_image_callback=lambda: _report_images(1, task.on_image),
+    )
+    for model in found.values():
+        _adjust(model, options)
+    return list(found.values())
 
 
 def _pipeline_options(task: MappingTask) -> pycolmap.IncrementalPipelineOptions:
@@ -302,7 +303,7 @@ def _run_global_mapper(task: MappingTask, output_folder: Path) -> list[pycolmap.
         best = max(best, _map_all(replace(task, database=own_copy), output_folder), key=rank)
         if rank(best)[0] == num_connected:
             break
-    _report_images(best, task.on_image)
+    _report_images(sum(model.num_reg_images() for model in best), task.on_image)
     return best
 
 
@@ -340,18 +341,22 @@ def _run_triangulator(
         row = pycolmap.Image(name=image.name, camera_id=cameras.cameras[index].camera_id, image_id=image_id)
         model.add_image_with_trivial_frame(row, cam_from_world)
     options = _pipeline_options(task)
-    model = pycolmap.triangulate_points(model, task.database, task.image_folder, output_folder, options=options)
+    triangulate = partial(pycolmap.triangulate_points, model, task.database, task.image_folder, output_folder)
+    model = triangulate(options=options)
+    if not model.num_points3D():  # where no three photos see the same, two must do
+        options.triangulation.ignore_two_view_tracks = False
+        model = triangulate(options=options)
     if not model.num_points3D():
         return []
     model.update_point_3d_errors()
-    _report_images([model], task.on_image)
+    _report_images(model.num_reg_images(), task.on_image)
     return [model]
 
 
-def _report_images(models: Sequence[pycolmap.Reconstruction], on_image: Callable[[], object] | None) -> None:
-    """Call on_image for each registered image."""
+def _report_images(count: int, on_image: Callable[[], object] | None) -> None:
+    """Call on_image for each of so many registered images."""
     if on_image:
-        for _ in range(sum(model.num_reg_images() for model in models)):
+        for _ in range(count):
             on_image()
 
 

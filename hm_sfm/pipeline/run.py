@@ -206,6 +206,7 @@ def map_database(
             config.mapping,
             config.verification.max_error_px,
             measure_px_scales(collection.images, config),
+            split_cameras=config.cameras.mode == "auto",
             on_image=progress.update,
         )
         return map_images(task, collection.images, collection.cameras)

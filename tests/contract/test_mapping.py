@@ -1,6 +1,7 @@
 """What hm_sfm.colmap.mapping makes of oracle scenes: cameras, points and keypoints known, matches exact or wrong."""
 
 import dataclasses
+import itertools
 import shutil
 import signal
 import subprocess
@@ -510,6 +511,61 @@ def test_wrong_poses_give_no_model(tmp_path, oracle):
     models = map_images(MappingTask(path, tmp_path, tmp_path / "sparse"), oracle.images, wrong)
     assert sum(model.num_points3D() for model in models) < 30
     assert bool(models) == (tmp_path / "sparse").exists()
+
+
+def take_photos(oracle: Oracle, chosen: list[int]) -> Oracle:
+    """Some photos of the scene, and the matches between them."""
+    names = {oracle.images[index].name for index in chosen}
+    return Oracle(
+        oracle.model,
+        [oracle.images[index] for index in chosen],
+        [oracle.keypoints[index] for index in chosen],
+        [some for some in oracle.matches if {some.pair.name0, some.pair.name1} <= names],
+    )
+
+
+def choose_near_pair(oracle: Oracle, prefix: str = "") -> list[int]:
+    """The two photos whose directions of view differ least, but by more than 7 degrees."""
+    directions = {prefix + image.name: image.viewing_direction() for image in oracle.model.images.values()}
+    angle_deg = {
+        (i, j): np.degrees(np.arccos(directions[oracle.images[i].name] @ directions[oracle.images[j].name]))
+        for i, j in itertools.combinations(range(len(oracle.images)), 2)
+    }
+    return list(min((pair for pair in angle_deg if angle_deg[pair] > 7), key=angle_deg.get))
+
+
+@pytest.mark.parametrize("mapper", ["incremental", "global", "poses"])
+def test_two_photos_give_a_model(tmp_path, oracle, mapper):
+    chosen = choose_near_pair(oracle)
+    two = take_photos(oracle, chosen)
+    camera = make_known_camera(oracle)
+    path = write_and_verify(tmp_path, two, camera)
+    cameras = Cameras((camera,), (0, 0), known=True)
+    if mapper == "poses":
+        poses = make_posed_cameras(oracle).cam_from_world
+        cameras = dataclasses.replace(cameras, cam_from_world=tuple(poses[index] for index in chosen))
+    config = MappingConfig() if mapper == "poses" else MappingConfig(mapper=mapper)
+    registered = []
+    task = MappingTask(path, tmp_path, tmp_path / "sparse", config, on_image=lambda: registered.append(1))
+    (model,) = map_images(task, two.images, cameras)
+    assert model.num_reg_images() == len(registered) == 2 and model.num_points3D() > 100
+    poses = {image.name: image.cam_from_world() for image in oracle.model.images.values()}
+    true = poses[two.images[1].name] * poses[two.images[0].name].inverse()
+    names = {image.name: image.cam_from_world() for image in model.images.values()}
+    estimate = names[two.images[1].name] * names[two.images[0].name].inverse()
+    assert np.degrees((estimate.rotation * true.rotation.inverse()).angle()) < 0.05
+
+
+def test_two_photos_of_another_place_are_a_second_model(tmp_path, oracle):
+    other = make_oracle(tmp_path, num_images=6, num_points=150, prefix="other/", seed=7)
+    two = take_photos(other, choose_near_pair(other, "other/"))
+    both = Oracle(
+        oracle.model, oracle.images + two.images, oracle.keypoints + two.keypoints, oracle.matches + two.matches
+    )
+    path = write_and_verify(tmp_path, both, make_known_camera(oracle))
+    first, second = map_incrementally(MappingTask(path, tmp_path, tmp_path / "sparse", fix_intrinsics=True))
+    assert_same_up_to_similarity(first, oracle.model)
+    assert {image.name for image in second.images.values() if image.has_pose} == {image.name for image in two.images}
 
 
 def test_verification_replaces_earlier_geometries_and_drops_planted_outliers(tmp_path, oracle):

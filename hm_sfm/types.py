@@ -13,7 +13,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from hm_sfm.geometry.homographies import apply_homographies
-from hm_sfm.geometry.nearest import find_nearest
+from hm_sfm.geometry.nearest import find_pairs_within
 
 
 def freeze_array(value: Any, dtype: type, shape: tuple[int | None, ...], what: str) -> np.ndarray:
@@ -78,7 +78,10 @@ class PatchMatches:
     homography: np.ndarray
     """(M, 3, 3) float32: image 0 px -> image 1 px around match i, scaled so that its denominator is 1 at xy0[i]."""
     patch_radius_px: float
-    """Half the side of a patch in image 0 px: homography i is estimated from |xy - xy0[i]| <= patch_radius_px."""
+    """Half the side of a patch in image 0 px: homography i is estimated from |x - x0[i]|, |y - y0[i]| <= this."""
+    size0_wh: tuple[int, int] | None = None
+    size1_wh: tuple[int, int] | None = None
+    """Px of image 0 and image 1; None where they are not known, as in matches that were read from a file."""
 
     def __post_init__(self) -> None:
         count = len(self.score)
@@ -101,34 +104,58 @@ class PatchMatches:
         )
 
     def warp(self, xy0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Transfer points of image 0 into image 1, each by the patch whose centre is nearest.
+        """Transfer points of image 0 into image 1, each by that of the patches it lies in whose centre is nearest.
 
-        xy0: (N, 2) px. Returns xy1 (N, 2) float32 px, NaN where not valid, and valid (N,) bool: a patch centre lies
-        within patch_radius_px.
+        xy0: (N, 2) px. Returns xy1 (N, 2) float32 px, NaN where not valid, and valid (N,) bool: the point lies in a
+        patch and, where the size of image 1 is known, ends up inside of it.
         """
         xy0 = np.asarray(xy0)
-        index, _ = find_nearest(xy0, self.xy0, self.patch_radius_px)
-        valid = index >= 0
+        point, patch, apart = find_pairs_within(xy0, self.xy0, np.sqrt(2) * self.patch_radius_px)
+        is_in_patch = np.abs(xy0[point] - self.xy0[patch]).max(axis=1, initial=0) <= self.patch_radius_px
+        point, patch, apart = point[is_in_patch], patch[is_in_patch], apart[is_in_patch]
+        order = np.lexsort((patch, apart, point))
+        point, first = np.unique(point[order], return_index=True)
         xy1 = np.full((len(xy0), 2), np.nan, np.float32)
-        xy1[valid] = apply_homographies(self.homography[index[valid]], xy0[valid])
+        xy1[point] = apply_homographies(self.homography[patch[order][first]], xy0[point])
+        valid = np.isfinite(xy1).all(axis=1) & self._ends_inside(xy1)
+        xy1[~valid] = np.nan
         return xy1, valid
 
-    def densify(self, radius: int) -> tuple[np.ndarray, np.ndarray]:
-        """The dense matches M_d of the paper: all pixel centres of image 0 around the patch centres.
+    def densify(self, radius: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        """The dense matches M_d of the paper: all pixels of image 0 that patches cover, and where they are in image 1.
 
-        radius: px of image 0, at most patch_radius_px; a patch takes the square of 2 * radius + 1 pixels around the
-        one that holds its centre. Overlaps go to the nearest centre. Returns xy0 and xy1, (N, 2) float32 px each,
-        row by row.
+        radius: how far from its centre a patch counts, in parts of patch_radius_px, in (0, 1]. With the whole radius,
+        no pixel between neighbouring patches is left out. Where patches overlap, the one whose centre is nearest
+        counts. Where the sizes of the images are known, nothing lies outside of either. Returns xy0, pixel centres,
+        and xy1, (N, 2) float32 px each, row by row. Raises ValueError on another radius.
         """
-        if not 0 <= radius <= self.patch_radius_px:
-            raise ValueError(f"radius must be within [0, {self.patch_radius_px}] px, got {radius}")
-        steps = np.arange(-radius, radius + 1)
-        square = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-        pixels = (np.floor(self.xy0).astype(np.int64)[:, None] + square).reshape(-1, 2)
-        xy0 = (np.unique(pixels[:, ::-1], axis=0)[:, ::-1] + 0.5).astype(np.float32)
-        # A centre may lie at the edge of its pixel: the square's farthest corner is sqrt(2) (radius + 1/2) away.
-        index, _ = find_nearest(xy0, self.xy0, 1.5 * (radius + 0.5))
-        return xy0, apply_homographies(self.homography[index], xy0)
+        if not 0 < radius <= 1:
+            raise ValueError(f"radius must be in (0, 1], in parts of the patches' own radius, got {radius}")
+        centres = self.xy0.astype(np.float64)
+        reach_px = radius * self.patch_radius_px
+        first = np.ceil(centres - reach_px - 0.5).astype(np.int64)
+        end = np.floor(centres + reach_px + 0.5).astype(np.int64)
+        if self.size0_wh:
+            first, end = first.clip(0, self.size0_wh), end.clip(0, self.size0_wh)
+        origin = first.min(axis=0, initial=0)
+        width, height = end.max(axis=0, initial=0) - origin
+        nearest, index = np.full((height, width), np.inf), np.full((height, width), -1)
+        for number, (centre, corner, opposite) in enumerate(zip(centres, first, end)):
+            (left, top), (right, bottom) = corner - origin, opposite - origin
+            (x, y), window = corner + 0.5 - centre, (slice(top, bottom), slice(left, right))
+            apart = np.hypot(x + np.arange(right - left), y + np.arange(bottom - top)[:, None])
+            is_nearer = apart < nearest[window]
+            nearest[window][is_nearer] = apart[is_nearer]
+            index[window][is_nearer] = number
+        row, column = np.nonzero(index >= 0)
+        xy0 = (np.stack([column, row], axis=1) + origin + 0.5).astype(np.float32)
+        xy1 = apply_homographies(self.homography[index[row, column]], xy0)
+        kept = self._ends_inside(xy1)
+        return xy0[kept], xy1[kept]
+
+    def _ends_inside(self, xy1: np.ndarray) -> np.ndarray:
+        """(N,) bool: which points (N, 2) px lie in image 1; all where its size is not known."""
+        return np.all((xy1 >= 0) & (xy1 < self.size1_wh), axis=1) if self.size1_wh else np.ones(len(xy1), bool)
 
 
 @dataclass(frozen=True, kw_only=True)

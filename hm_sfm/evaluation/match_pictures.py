@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from hm_sfm.evaluation.relative_poses import PosePair
 from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.io.atomic import replace_file
+from hm_sfm.io.pictures import encode_picture
 from hm_sfm.photos.images import prepare_image, read_ref
 from hm_sfm.report.drawn_matches import draw_matches, draw_photo_matches
 from hm_sfm.types import PatchMatches
@@ -48,9 +48,8 @@ class MatchPictures:
         self._write(f"{path0.stem}-{path1.stem}", picture)
 
     def _write(self, name: str, picture: np.ndarray) -> None:
-        _, code = cv2.imencode(".png", picture)
         with replace_file(self.folder / f"{self.count:04d}_{name}.png") as temporary:
-            temporary.write_bytes(code.tobytes())
+            temporary.write_bytes(encode_picture(picture, ".png"))
         self.count += 1
 
 

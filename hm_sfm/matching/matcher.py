@@ -127,6 +127,8 @@ class HomoMatcher:
             score=stored.score[keep],
             homography=stored.homography[keep],
             patch_radius_px=stored.patch_radius_px,
+            size0_wh=features0.image.size_wh,
+            size1_wh=features1.image.size_wh,
         )
 
     def _lay_grid(self, size_wh: tuple[int, int], is_chessboard: bool) -> PatchGrid:

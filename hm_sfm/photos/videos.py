@@ -16,6 +16,7 @@ from tqdm import tqdm
 from hm_sfm.config import fingerprint
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.io.atomic import make_folder
+from hm_sfm.io.pictures import encode_picture
 from hm_sfm.photos.images import EXTENSIONS
 
 logger = logging.getLogger(__name__)
@@ -96,8 +97,7 @@ def write_frames(video: Path, folder: Path, every_ms: int, image_format: str, ma
         rows = []
         for milliseconds, frame in choose_sharpest(count_frames(video, quiet), every_ms):
             name = f"{video.stem}_{milliseconds:08d}.{image_format}"
-            _, code = cv2.imencode(f".{image_format}", frame)
-            (temporary / name).write_bytes(code.tobytes())
+            (temporary / name).write_bytes(encode_picture(frame, f".{image_format}"))
             rows.append((f"{folder.name}/{name}", f"{milliseconds / 1000:.3f}"))
         with open(temporary / TABLE, "w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows([("name", "seconds"), *rows])

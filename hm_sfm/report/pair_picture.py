@@ -12,6 +12,7 @@ from hm_sfm.config import CameraConfig, VerificationConfig
 from hm_sfm.errors import InputError
 from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.io.atomic import replace_file
+from hm_sfm.io.pictures import encode_picture
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.photos.images import PreparedImage, prepare_image, read_ref
 from hm_sfm.report.drawn_matches import GAP_PX, WORST_PX, draw_photo_matches, make_grey, place_points
@@ -47,9 +48,8 @@ def check_picture_path(path: Path) -> None:
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
     """Write (H, W, 3) uint8 BGR, atomically; the format goes by the file's ending."""
-    _, code = cv2.imencode(Path(path).suffix.lower(), picture)
     with replace_file(path) as temporary:
-        temporary.write_bytes(code.tobytes())
+        temporary.write_bytes(encode_picture(picture, Path(path).suffix.lower()))
 
 
 def draw_pair(matcher: HomoMatcher, path_a: Path, path_b: Path, checks: VerificationConfig) -> PairPicture:

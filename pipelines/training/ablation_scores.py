@@ -148,8 +148,7 @@ def measure_matches(matcher: HomoMatcher, pair: dict[str, np.ndarray]) -> tuple[
         return np.linalg.norm(xy1[shown] - apply_homographies(pair["b_from_a"][surface[shown]], xy0[shown]), axis=1)
 
     matches = matcher.match(*pair["images"])
-    radius_px = int(DENSE_RADIUS * matcher.net.backbone.fine_grid.stride)
-    return measure(*matches.densify(radius_px)), measure(matches.xy0, matches.xy1)
+    return measure(*matches.densify(DENSE_RADIUS / matcher.net.head.half)), measure(matches.xy0, matches.xy1)
 
 
 def time_stages(matcher: HomoMatcher, pair: PosePair) -> Scores:

@@ -153,7 +153,7 @@ def test_no_matches_at_all():
     assert len(found) == 0 and found.homography.shape == (0, 3, 3)
     xy1, valid = found.warp(np.array([[3.0, 4.0]]))
     assert not valid.any() and np.isnan(xy1).all()
-    assert [dense.shape for dense in found.densify(2)] == [(0, 2), (0, 2)]
+    assert [dense.shape for dense in found.densify()] == [(0, 2), (0, 2)]
 
 
 def test_max_matches_keeps_the_most_similar():

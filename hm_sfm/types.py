@@ -30,9 +30,16 @@ def freeze_array(value: Any, dtype: type, shape: tuple[int | None, ...], what: s
     return array
 
 
+Position = tuple[float, float, float | None]
+"""Latitude and longitude in degrees (WGS84) and altitude in m, None where it is not known."""
+
+
 @dataclass(frozen=True)
 class ImageRef:
-    """One photo of the collection. `name` is the key everywhere: its POSIX path relative to the image folder."""
+    """One photo of the collection. `name` is the key everywhere: its POSIX path relative to the image folder.
+
+    EXIF's orientation is a clockwise turn by `rotation_deg`, followed by a flip where the photo is `mirrored`.
+    """
 
     name: str
     path: Path
@@ -40,8 +47,13 @@ class ImageRef:
     """Stored size, px, before any EXIF rotation."""
     rotation_deg: int = 0
     """Clockwise turn (0, 90, 180, 270) that EXIF asks for to show the photo upright."""
-    gps: tuple[float, float, float] | None = None
-    """Latitude and longitude in degrees (WGS84) and altitude in m, as EXIF has them."""
+    gps: Position | None = None
+    """As EXIF has it."""
+    mirrored: bool = False
+    """Whether EXIF asks for the photo, once it is turned, to be flipped left to right as well."""
+    flipped: bool = False
+    """Whether coordinates are px of the photo as stored but flipped left to right. Those of a run are where a photo is
+    mirrored: no camera of COLMAP takes mirrored photos, and its model would be wrong."""
 
     def __post_init__(self) -> None:
         if self.rotation_deg not in (0, 90, 180, 270):

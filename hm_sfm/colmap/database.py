@@ -83,7 +83,7 @@ def _write_image(
     frame.add_data_id(row.data_id)
     database.write_frame(frame, use_frame_id=True)
     database.write_keypoints(image_id, keypoints.xy)
-    if image.gps:
+    if image.gps and image.gps[2] is not None:  # as COLMAP, which wants an altitude, too
         wgs84 = pycolmap.PosePriorCoordinateSystem.WGS84
         prior = pycolmap.PosePrior(position=image.gps, coordinate_system=wgs84, corr_data_id=row.data_id)
         database.write_pose_prior(prior)

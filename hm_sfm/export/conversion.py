@@ -26,7 +26,9 @@ from hm_sfm.formats.hloc import write_features, write_matches
 from hm_sfm.formats.pairs_files import read_pairs, write_pairs
 from hm_sfm.io.atomic import make_folder, replace_file
 from hm_sfm.io.colmap_log import quiet_colmap
-from hm_sfm.photos.bitmaps import FOREIGN_EXTENSIONS
+from hm_sfm.io.markers import MADE_MARKER
+from hm_sfm.photos.bitmaps import is_read_by_colmap, open_to_colmap
+from hm_sfm.photos.images import read_run_ref
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 logger = logging.getLogger(__name__)
@@ -173,15 +175,17 @@ def undistort_photos(out: Path, folder: Path, image_folder: Path | None) -> pyco
             f"{photos} lacks {len(missing)} of {len(names)} photos of the model, for example {missing[0]!r}: name the "
             "folder of photos with --images"
         )
-    foreign = [name for name in names if Path(name).suffix.lower() in FOREIGN_EXTENSIONS]
+    images = [read_run_ref(photos / name, name) for name in names]
+    foreign = [name for name in names if not is_read_by_colmap(photos / name)]
     if foreign:
         raise InputError(
-            f"COLMAP cannot undistort HEIC and WebP photos, such as {photos / foreign[0]}: convert the {len(foreign)} "
-            "of them to JPEG and reconstruct again"
+            f"COLMAP cannot undistort photos of the kind of {photos / foreign[0]}: convert the {len(foreign)} of them "
+            "to JPEG and reconstruct again"
         )
     # What COLMAP logs are the photos that it cannot read, which are told below.
     with tempfile.TemporaryDirectory(dir=folder) as temporary, quiet_colmap(pycolmap.logging.FATAL):
-        pycolmap.undistort_images(temporary, out / "sparse" / "0", photos)
+        with open_to_colmap(images, photos) as readable_photos:
+            pycolmap.undistort_images(temporary, out / "sparse" / "0", readable_photos)
         undistorted = Path(temporary) / "images"
         written = {path.relative_to(undistorted).as_posix() for path in undistorted.rglob("*")}
         failed = [name for name in names if name not in written]
@@ -189,6 +193,7 @@ def undistort_photos(out: Path, folder: Path, image_folder: Path | None) -> pyco
             raise InputError(f"cannot undistort {len(failed)} of {len(names)} photos, for example {photos / failed[0]}")
         os.replace(undistorted, folder / "images")
         model = read_model(Path(temporary) / "sparse")
+    (folder / MADE_MARKER).touch()
     for camera in model.cameras.values():
         if camera.model == pycolmap.CameraModelId.SIMPLE_PINHOLE:  # undistorted already, so it was left as it is
             focal, cx, cy = camera.params

@@ -66,3 +66,8 @@ def rotation_matrix(size_wh: tuple[int, int], rotation_deg: int) -> np.ndarray:
         270: [[0, 1, 0], [-1, 0, width], [0, 0, 1]],
     }
     return np.array(matrices[rotation_deg], dtype=np.float64)
+
+
+def flip_matrix(width: int) -> np.ndarray:
+    """(3, 3) float64: px of an image of that width -> px of that image flipped left to right, and back."""
+    return np.array([[-1, 0, width], [0, 1, 0], [0, 0, 1]], dtype=np.float64)

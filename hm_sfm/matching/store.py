@@ -31,12 +31,15 @@ MERGED_AT_ONCE = 500
 
 
 def digest_image(image: ImageRef) -> str:
-    """16 hex digits of the photo's bytes. Raises InputError where it cannot be read."""
+    """16 hex digits of the photo's bytes and of its frame of coordinates. Raises InputError where it cannot be read."""
     try:
         with open(image.path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+            digest = hashlib.file_digest(file, "sha256")
     except OSError as error:
         raise InputError(f"cannot read the image {image.path}: {error.strerror}") from error
+    if image.flipped:
+        digest.update(b"flipped")
+    return digest.hexdigest()[:16]
 
 
 @contextmanager

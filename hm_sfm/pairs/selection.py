@@ -14,7 +14,7 @@ from hm_sfm.config import PairConfig
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.formats.pairs_files import read_pairs
 from hm_sfm.io.colmap_log import quiet_colmap
-from hm_sfm.types import ImagePair
+from hm_sfm.types import ImagePair, Position
 
 logger = logging.getLogger(__name__)
 
@@ -22,8 +22,6 @@ MODES = ("auto", "exhaustive", "sequential", "retrieval", "spatial")
 LOOP_WINDOWS = 4
 """A sequence closes a loop where it comes back after more than so many windows."""
 
-Position = tuple[float, float, float]
-"""Latitude and longitude in degrees (WGS84) and altitude in m."""
 FindSimilar = Callable[[Sequence[str], int, int], np.ndarray]
 """(names, top, gap) -> (N, top) int64: for each name the positions in `names` of the `top` images most like it that
 are more than `gap` places away, best first; -1 where there are no more."""
@@ -106,7 +104,7 @@ def pair_sequentially(names: Sequence[str], window: int) -> tuple[ImagePair, ...
 def pair_spatially(positions: Mapping[str, Position], top: int, distance_m: float) -> tuple[ImagePair, ...]:
     """Each image with the `top` images taken nearest to it, none farther away than `distance_m`, by COLMAP.
 
-    positions: latitude and longitude in degrees (WGS84) and altitude in m, which is ignored, by image name.
+    positions: by image name; altitudes are ignored.
     """
     names = sorted(positions)
     with (
@@ -166,8 +164,11 @@ def _write_positions(database: pycolmap.Database, names: Sequence[str], position
             image = pycolmap.Image(name=name, camera_id=1, image_id=image_id)
             database.write_image(image, use_image_id=True)
             wgs84 = pycolmap.PosePriorCoordinateSystem.WGS84
+            latitude, longitude, altitude = positions[name]
             prior = pycolmap.PosePrior(
-                corr_data_id=image.data_id, position=np.array(positions[name]), coordinate_system=wgs84
+                corr_data_id=image.data_id,
+                position=np.array([latitude, longitude, altitude or 0.0]),
+                coordinate_system=wgs84,
             )
             database.write_pose_prior(prior)
 

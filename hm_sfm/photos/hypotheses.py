@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 
 from hm_sfm.geometry.frames import rotation_matrix
-from hm_sfm.photos.images import CV_ROTATIONS, PreparedImage
+from hm_sfm.photos.images import PreparedImage
+from hm_sfm.photos.orientation import CV_ROTATIONS
 
 ROTATIONS_DEG = (0, *CV_ROTATIONS)
 
@@ -38,5 +39,7 @@ def apply_hypothesis(image: PreparedImage, hypothesis: Hypothesis) -> PreparedIm
     scaled_from_reduced = np.diag([width / reduced_wh[0], height / reduced_wh[1], 1.0])
     reduced_from_turned = rotation_matrix(scaled_wh, -hypothesis.rotation_deg % 360)
     # Providers of coarse matches that read the photo themselves turn it as its reference says.
-    ref = dataclasses.replace(image.ref, rotation_deg=(image.ref.rotation_deg + hypothesis.rotation_deg) % 360)
+    # Its mirrored pixels are flipped after the turn, so they turn the other way.
+    turn_deg = -hypothesis.rotation_deg if image.ref.mirrored else hypothesis.rotation_deg
+    ref = dataclasses.replace(image.ref, rotation_deg=(image.ref.rotation_deg + turn_deg) % 360)
     return PreparedImage(ref, grey, scaled_wh, image.stored_from_scaled @ scaled_from_reduced @ reduced_from_turned)

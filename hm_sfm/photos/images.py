@@ -1,41 +1,52 @@
 """Stage 1: the photos of a folder, and one photo made ready for the network: grey, upright, reduced.
 
-Photos are read as COLMAP reads them, unrotated. Where EXIF says that a photo is rotated it is rotated for matching,
-and `PreparedImage.stored_from_scaled` maps the points back. HEIC, which COLMAP cannot read, is upright when decoded.
+Photos are read as COLMAP reads them, unrotated. Where EXIF says that a photo is rotated or mirrored it is matched as
+viewers show it, and `PreparedImage.stored_from_scaled` maps the points back. HEIC, which COLMAP cannot read, is upright
+when decoded.
 """
 
 import logging
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
 
-from hm_sfm.errors import ConfigError, InputError
-from hm_sfm.geometry.frames import rotation_matrix
-from hm_sfm.photos.bitmaps import HEIC_EXTENSIONS, INSTALL_HEIC, can_read_heic, read_bitmap
-from hm_sfm.types import ImageRef, freeze_array
+from hm_sfm.errors import ConfigError, InputError, MissingPackageError
+from hm_sfm.geometry.frames import flip_matrix, rotation_matrix
+from hm_sfm.photos.bitmaps import (
+    INSTALL_HEIC,
+    JPEG_MAGIC,
+    PNG_MAGIC,
+    TIFF_MAGICS,
+    can_read_heic,
+    decode_quietly,
+    lacks_range,
+    read_bitmap,
+    read_deep_tiff,
+)
+from hm_sfm.photos.folders import find_files
+from hm_sfm.photos.orientation import MIRRORED_IN_EXIF, ROTATION_FROM_EXIF, show_upright
+from hm_sfm.types import ImageRef, Position, freeze_array
 
 logger = logging.getLogger(__name__)
 
-EXTENSIONS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+JPEG_EXTENSIONS = (".jpg", ".jpeg", ".jpe", ".jfif", ".mpo")
+EXTENSIONS = (*JPEG_EXTENSIONS, ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp", ".avif", ".gif", ".jp2")
+HEIC_EXTENSIONS = (".heic", ".heif", ".hif")
+RAW_EXTENSIONS = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw")
+UNREADABLE_EXTENSIONS = (*RAW_EXTENSIONS, ".jxl", ".psd", ".exr", ".hdr")
+"""Of photos that no library here reads."""
 MIN_EDGE_PX = 32
 """The network's coarse cells are 8 px: below this there is nothing to match."""
-
-# Clockwise turn that brings the top of the scene to the top. The mirrored orientations (2, 4, 5, 7) get that turn too,
-# but stay mirrored: points map back the same way, and no camera writes them.
-ROTATION_FROM_EXIF = {1: 0, 2: 0, 3: 180, 4: 180, 5: 90, 6: 90, 7: 270, 8: 270}
-CV_ROTATIONS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
 # ANYDEPTH keeps 16 bits. The conversion to grey drops alpha: COLMAP ignores it too, and compositing would draw
 # edges against an invented background.
 CV_FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
-JPEG_MAGIC = b"\xff\xd8"
-PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-HEIC_MAGIC = b"ftyp"
-"""After the 4 bytes of a length."""
+BMP_MAGIC = b"BM"
 PNG_END = b"IEND\xaeB`\x82"
 
 
@@ -59,7 +70,7 @@ class PreparedImage:
     scaled_wh: tuple[int, int]
     """(W, H) of `grey`, px."""
     stored_from_scaled: np.ndarray
-    """(3, 3) float64, affine: px of `grey` -> px of the stored image (COLMAP's frame)."""
+    """(3, 3) float64, affine: px of `grey` -> px of the stored image (COLMAP's frame), flipped where `ref` says so."""
 
     def __post_init__(self) -> None:
         width, height = self.scaled_wh
@@ -70,22 +81,19 @@ class PreparedImage:
 
 
 def list_images(folder: Path) -> ImageList:
-    """List the photos below `folder`, subfolders included, sorted by name; hidden files and folders are ignored.
+    """List the photos below `folder`, subfolders and linked ones included, sorted by name, see find_files.
 
-    A file that is named like an image but is damaged, smaller than 32 px on a side, or unknown to COLMAP is skipped:
-    it is logged as a warning and reported in `skipped`; where the package for HEIC is not installed, HEIC photos are
-    skipped with one warning.
+    A file that is named like an image but is cut short, smaller than 32 px on a side, or of a kind that cannot be read
+    is skipped: it is logged as a warning and reported in `skipped`; where the package for HEIC is not installed, HEIC
+    photos are skipped with one warning. Mirrored photos are listed as flipped, see ImageRef.
 
     Raises InputError where the folder does not exist, is not a folder, or holds no usable image.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"the image folder {folder} " + ("is not a folder" if folder.exists() else "does not exist"))
-    relative = [path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir()]
-    names = [path.as_posix() for path in relative if not any(part.startswith(".") for part in path.parts)]
+    names = find_files(folder)
     kinds = EXTENSIONS + HEIC_EXTENSIONS if can_read_heic() else EXTENSIONS
-    candidates = sorted(name for name in names if Path(name).suffix.lower() in kinds)
-    heic = sorted(name for name in set(names).difference(candidates) if Path(name).suffix.lower() in HEIC_EXTENSIONS)
+    candidates = [name for name in names if Path(name).suffix.lower() in kinds + UNREADABLE_EXTENSIONS]
+    heic = [name for name in names if Path(name).suffix.lower() in set(HEIC_EXTENSIONS).difference(kinds)]
     if not candidates and not heic:
         listed = ", ".join(extension[1:] for extension in kinds)
         raise InputError(f"the image folder {folder} holds {len(names)} files but no image ({listed})")
@@ -96,8 +104,8 @@ def list_images(folder: Path) -> ImageList:
         logger.warning("skipped: %s (%d such files)", skipped[0][1], len(heic))
     for name in candidates:
         try:
-            images.append(read_ref(folder / name, name))
-        except InputError as error:
+            images.append(read_run_ref(folder / name, name))
+        except (InputError, MissingPackageError) as error:
             logger.warning("skipped: %s", error)
             skipped.append((name, str(error)))
     if not images:
@@ -112,52 +120,56 @@ def read_ref(path: Path, name: str | None = None) -> ImageRef:
 
     `name` defaults to the file's own name.
 
-    Raises InputError where the file cannot be read or decoded, is cut short, or is smaller than 32 px on a side, and
-    MissingPackageError where it needs a package that is not installed.
+    A JPEG that is damaged inside, but has an end, is logged as a warning. Raises InputError where the file cannot be
+    read or decoded, is cut short, or is smaller than 32 px on a side, and MissingPackageError where it needs a package
+    that is not installed.
     """
     path = Path(path)
     name = path.name if name is None else name
     if not _is_storable(name):
         raise InputError(f"{str(path)!r} has a line break or bytes that are not UTF-8 in its name")
+    if path.suffix.lower() in UNREADABLE_EXTENSIONS:
+        raise InputError(f"{path} is of a kind that cannot be read: convert it to JPEG, PNG or TIFF")
     data = _read_bytes(path)
     bitmap = read_bitmap(path, as_rgb=False)
     if bitmap is None:
-        if _decode(data) is None:
-            raise InputError(f"{path} cannot be decoded as an image")
-        raise InputError(f"{path} is of a kind that COLMAP cannot read: convert it to JPEG or PNG")
+        raise InputError(f"{path} cannot be decoded as an image")
     if not _is_complete(data):
         raise InputError(f"{path} is cut short or cannot be decoded")
     size_wh = (bitmap.width, bitmap.height)
     _check_size(size_wh, str(path))
-    rotation_deg = ROTATION_FROM_EXIF.get(bitmap.exif_orientation() or 1, 0)
-    return ImageRef(name, path, size_wh, rotation_deg, _read_gps(bitmap))
+    orientation = bitmap.exif_orientation() or 1
+    rotation_deg, mirrored = ROTATION_FROM_EXIF.get(orientation, 0), orientation in MIRRORED_IN_EXIF
+    if data.startswith(JPEG_MAGIC) and (damage := _find_damage(data)):
+        logger.warning("%s is damaged, parts of it show nothing or something wrong: %s", path, damage)
+    return ImageRef(name, path, size_wh, rotation_deg, _read_gps(bitmap), mirrored)
 
 
-def _read_gps(bitmap: pycolmap.Bitmap) -> tuple[float, float, float] | None:
-    """ImageRef.gps; None unless EXIF has all of it, as COLMAP does, and where receivers without a fix left zeros."""
+def read_run_ref(path: Path, name: str) -> ImageRef:
+    """read_ref of a photo of a run: a mirrored one is flipped, see ImageRef."""
+    ref = read_ref(path, name)
+    return replace(ref, flipped=ref.mirrored)
+
+
+def _read_gps(bitmap: pycolmap.Bitmap) -> Position | None:
+    """ImageRef.gps; None where EXIF has no possible position, or the zeros of a receiver without a fix."""
     latitude, longitude, altitude = bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()
-    if latitude is None or longitude is None or altitude is None:
+    if latitude is None or longitude is None or latitude == longitude == 0:
         return None
-    if not np.isfinite([latitude, longitude, altitude]).all() or latitude == longitude == 0:
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180):  # nor are infinities and NaN
         return None
-    return (latitude, longitude, altitude) if abs(latitude) <= 90 and abs(longitude) <= 180 else None
+    return latitude, longitude, altitude if altitude is not None and math.isfinite(altitude) else None
 
 
 def prepare_image(ref: ImageRef, long_edge_px: int) -> PreparedImage:
     """Read a photo's pixels, turn them upright and reduce them so that the long edge is at most `long_edge_px`.
 
-    Colour becomes grey, the 16 bits of a PNG are kept, alpha is dropped. Never enlarged, never padded.
+    Colour becomes grey, the 16 bits of a PNG or TIFF are kept, alpha is dropped. Never enlarged, never padded.
 
     Raises InputError where the file cannot be decoded or has changed size since it was listed, ConfigError where
     long_edge_px is below 32.
     """
-    data = _read_bytes(ref.path)
-    if data.startswith((JPEG_MAGIC, PNG_MAGIC)):
-        grey = _decode(data)
-    else:
-        # OpenCV turns a TIFF as its orientation tag says, even when told not to; COLMAP's reader does not.
-        bitmap = read_bitmap(ref.path, as_rgb=False)
-        grey = None if bitmap is None else bitmap.to_array().reshape(bitmap.height, bitmap.width)
+    grey = _read_grey(ref)
     if grey is None:
         raise InputError(f"{ref.path} cannot be decoded as an image")
     decoded_wh = (grey.shape[1], grey.shape[0])
@@ -167,6 +179,18 @@ def prepare_image(ref: ImageRef, long_edge_px: int) -> PreparedImage:
             f"{ref.size_wh[0]} x {ref.size_wh[1]} px"
         )
     return _prepare(ref, grey, long_edge_px)
+
+
+def _read_grey(ref: ImageRef) -> np.ndarray | None:
+    """(H, W) uint8 or uint16, as stored; None where the file cannot be decoded."""
+    data = _read_bytes(ref.path)
+    if data.startswith((JPEG_MAGIC, PNG_MAGIC)):
+        return decode_quietly(data, CV_FLAGS)[0]
+    deep = read_deep_tiff(data, ref) if data.startswith(TIFF_MAGICS) else None
+    if deep is not None or lacks_range(ref.path):
+        return deep
+    bitmap = read_bitmap(ref.path, as_rgb=False)
+    return None if bitmap is None else bitmap.to_array().reshape(bitmap.height, bitmap.width)
 
 
 def prepare_array(array: np.ndarray, long_edge_px: int, name: str = "array") -> PreparedImage:
@@ -187,12 +211,10 @@ def prepare_array(array: np.ndarray, long_edge_px: int, name: str = "array") -> 
 def read_rgb(image: PreparedImage) -> np.ndarray:
     """(H, W, 3) uint8 RGB of a prepared image, rotated and reduced as it is; grey where there is no file to read."""
     bitmap = read_bitmap(image.ref.path, as_rgb=True) if image.ref.path.is_file() else None
-    if bitmap is None or (bitmap.width, bitmap.height) != tuple(image.ref.size_wh):
+    is_usable = bitmap is not None and not lacks_range(image.ref.path)
+    if bitmap is None or not is_usable or (bitmap.width, bitmap.height) != tuple(image.ref.size_wh):
         return np.repeat(np.rint(image.grey * 255).astype(np.uint8)[:, :, None], 3, axis=2)
-    rgb = bitmap.to_array()
-    if image.ref.rotation_deg:
-        rgb = cv2.rotate(rgb, CV_ROTATIONS[image.ref.rotation_deg])
-    return cv2.resize(rgb, image.scaled_wh, interpolation=cv2.INTER_AREA)
+    return cv2.resize(show_upright(bitmap.to_array(), image.ref), image.scaled_wh, interpolation=cv2.INTER_AREA)
 
 
 def _prepare(ref: ImageRef, stored: np.ndarray, long_edge_px: int) -> PreparedImage:
@@ -204,12 +226,15 @@ def _prepare(ref: ImageRef, stored: np.ndarray, long_edge_px: int) -> PreparedIm
     reduced_wh = (max(1, round(width * scale)), max(1, round(height * scale)))
     reduced = stored if scale == 1.0 else cv2.resize(stored, reduced_wh, interpolation=cv2.INTER_AREA)
     grey = reduced.astype(np.float32) / np.iinfo(reduced.dtype.type).max
-    if ref.rotation_deg:
-        grey = cv2.rotate(grey, CV_ROTATIONS[ref.rotation_deg])
+    grey = show_upright(grey, ref)
     scaled_wh = (grey.shape[1], grey.shape[0])
-    stored_from_reduced = np.diag([width / reduced_wh[0], height / reduced_wh[1], 1.0])
-    reduced_from_scaled = rotation_matrix(scaled_wh, -ref.rotation_deg % 360)
-    return PreparedImage(ref, grey, scaled_wh, stored_from_reduced @ reduced_from_scaled)
+    stored_from_scaled = rotation_matrix(scaled_wh, -ref.rotation_deg % 360)
+    if ref.mirrored:
+        stored_from_scaled = stored_from_scaled @ flip_matrix(scaled_wh[0])
+    stored_from_scaled = np.diag([width / reduced_wh[0], height / reduced_wh[1], 1.0]) @ stored_from_scaled
+    if ref.flipped:
+        stored_from_scaled = flip_matrix(width) @ stored_from_scaled
+    return PreparedImage(ref, grey, scaled_wh, stored_from_scaled)
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -219,25 +244,21 @@ def _read_bytes(path: Path) -> bytes:
         raise InputError(f"cannot read the image {path}: {error.strerror}") from error
 
 
-def _decode(data: bytes) -> np.ndarray | None:
-    """The stored pixels, (H, W) grey of the file's own depth, or None."""
-    if not data:
-        return None
-    try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), CV_FLAGS)
-    except cv2.error:
-        return None
-
-
 def _is_complete(data: bytes) -> bool:
     """Whether an image file is whole. Bytes after the end of a JPEG or PNG are allowed: phones append videos."""
     if data.startswith(JPEG_MAGIC):
         return _has_jpeg_end(data)
     if data.startswith(PNG_MAGIC):
-        return PNG_END in data
-    if data[4:8] == HEIC_MAGIC:
-        return True  # what is cut short cannot be decoded
-    return _decode(data) is not None
+        return PNG_END in data and decode_quietly(data, CV_FLAGS)[0] is not None
+    if data.startswith((*TIFF_MAGICS, BMP_MAGIC)):
+        return decode_quietly(data, cv2.IMREAD_UNCHANGED)[0] is not None
+    return True  # the decoders of all other kinds refuse what is cut short
+
+
+def _find_damage(data: bytes) -> str:
+    """What is wrong inside a JPEG that decoders read nevertheless: they fill it with grey or with noise."""
+    _, complaints = decode_quietly(data, cv2.IMREAD_REDUCED_GRAYSCALE_8)
+    return complaints[0] if complaints else ""
 
 
 def _has_jpeg_end(data: bytes) -> bool:

@@ -87,8 +87,8 @@ def read_masks(images: Sequence[ImageRef], config: MaskConfig) -> Masks:
                 "%d of %d images are not of the size of the mask %s: it is not theirs", rest, len(images), path
             )
         for image in of_its_size:
-            own = visible.get(image.name)
-            visible[image.name] = _pack(shared) if own is None else own & _pack(shared)
+            own, packed = visible.get(image.name), _pack(_flip_as(image, shared))
+            visible[image.name] = packed if own is None else own & packed
     return Masks(visible)
 
 
@@ -115,7 +115,7 @@ def _read_folder(images: Sequence[ImageRef], folder: Path) -> dict[str, np.ndarr
                 f"the mask {path} is {mask.shape[1]} x {mask.shape[0]} px but its image {image.name} is "
                 f"{image.size_wh[0]} x {image.size_wh[1]} px"
             )
-        packed[image.name] = _pack(mask)
+        packed[image.name] = _pack(_flip_as(image, mask))
     if not packed:
         raise InputError(
             f"the mask folder {folder} holds no mask of any of the {len(images)} images: that of {images[0].name} "
@@ -132,6 +132,11 @@ def _read_mask(path: Path) -> np.ndarray:
     if bitmap is None:
         raise InputError(f"cannot read the mask {path}: it " + ("is no image" if path.exists() else "does not exist"))
     return bitmap.to_array().reshape(bitmap.height, bitmap.width) > 0
+
+
+def _flip_as(image: ImageRef, mask: np.ndarray) -> np.ndarray:
+    """A mask of the stored photo, (H, W) bool, in the frame of the photo's coordinates."""
+    return mask[:, ::-1] if image.flipped else mask
 
 
 def _pack(mask: np.ndarray) -> np.ndarray:

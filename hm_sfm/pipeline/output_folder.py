@@ -7,13 +7,12 @@ from pathlib import Path
 from hm_sfm.config import Config
 from hm_sfm.errors import InputError
 from hm_sfm.io.locks import lock_file
+from hm_sfm.io.markers import RUN_MARKER
 from hm_sfm.matching.providers.choice import describe_coarse
 from hm_sfm.matching.store import MatchStore, digest_image
 from hm_sfm.network.checkpoints import digest_weights
 from hm_sfm.types import ImageRef
 
-MARKER = ".hm_sfm"
-"""File that marks a folder as the output of a run."""
 MATCHES_FILE = "matches.h5"
 UNDESCRIBED = {
     ("matching", key)
@@ -29,11 +28,11 @@ def claim_folder(out: Path, shared: bool = False) -> None:
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        foreign = any(out.iterdir()) and not (out / MARKER).exists()
+        foreign = any(out.iterdir()) and not (out / RUN_MARKER).exists()
         if not foreign:
-            (out / MARKER).touch()
+            (out / RUN_MARKER).touch()
             in_use = f"the output folder {out} is in use by another hm-sfm process: wait for it, or name another OUT"
-            lock_file(out / MARKER, in_use, shared)
+            lock_file(out / RUN_MARKER, in_use, shared)
     except OSError as error:
         raise InputError(f"cannot write to the output folder {out}: {error.strerror}") from error
     if foreign:

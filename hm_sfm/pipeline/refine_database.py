@@ -5,6 +5,7 @@ our own, with the matched keypoints of the database as the seeds of tracks. Its 
 """
 
 import dataclasses
+import logging
 import shutil
 import tempfile
 from dataclasses import dataclass
@@ -31,6 +32,8 @@ from hm_sfm.pipeline.output_folder import claim_folder
 from hm_sfm.pipeline.run import Run, load_matcher
 from hm_sfm.pipeline.timings import Timings
 from hm_sfm.types import ImagePair, ImageRef
+
+logger = logging.getLogger(__name__)
 
 VERIFIED_FILE = "verified.h5"
 """The matches of the database, in OUT, as a file of coarse matches."""
@@ -97,6 +100,12 @@ def read_database(path: Path, image_folder: Path) -> DatabaseContent:
     if not matches:
         raise InputError(f"{path} has no verified matches of its {len(rows)} images: match them with COLMAP first")
     images = tuple(read_ref(image_folder / row.name, row.name) for row in rows)
+    mirrored = [image.name for image in images if image.mirrored]
+    if mirrored:
+        logger.warning(
+            "%d photos are mirrored, such as %s: the keypoints in %s are taken for px of the photos as stored, not of "
+            "the flipped ones", len(mirrored), mirrored[0], path
+        )  # fmt: skip
     for image, row in zip(images, rows):
         check_size(path, image, cameras[row.camera_id], keypoints[image.name])
     ids = list(dict.fromkeys(row.camera_id for row in rows))

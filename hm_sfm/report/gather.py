@@ -133,7 +133,7 @@ def gather_report(
         images=tuple(measure_images(images, model, keypoints, (point, image, keypoint), reasons)),
         num_pairs=num_pairs,
         verified_pairs={(index[pair.name0], index[pair.name1]): len(rows) for pair, rows in verified.items()},
-        scene=lay_out_scene(model, {ref.name: ref.rotation_deg for ref in images}) if models else None,
+        scene=lay_out_scene(model, {ref.name: _turn_to_upright(ref) for ref in images}) if models else None,
         track_lengths={"this run": this_run, **read_baselines(out / "compare.json", len(images), config)},
         weak_pairs=draw_weak_pairs({ref.name: ref for ref in images}, model, verified, keypoints),
         diagnoses=tuple(diagnoses),
@@ -189,8 +189,13 @@ def measure_images(
     return metrics
 
 
+def _turn_to_upright(image: ImageRef) -> int:
+    """Clockwise, of the photo as its coordinates are: a flipped one turns the other way."""
+    return -image.rotation_deg % 360 if image.flipped else image.rotation_deg
+
+
 def lay_out_scene(model: pycolmap.Reconstruction, rotation_deg: Mapping[str, int]) -> Scene:
-    """Points and cameras, rotated upright and scaled. rotation_deg: by image name, see ImageRef."""
+    """Points and cameras, rotated upright and scaled. rotation_deg: clockwise, to show a photo upright, by its name."""
     posed = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
     ids = sorted(model.points3D)
     shown = np.unique(np.linspace(0, len(ids) - 1, min(len(ids), MOST_POINTS)).round().astype(np.int64))

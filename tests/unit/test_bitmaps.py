@@ -1,5 +1,6 @@
-"""Photos of kinds that COLMAP cannot read: HEIC, turned as phones store it, and WebP."""
+"""Photos of kinds that COLMAP cannot read: HEIC, turned as phones store it, WebP, AVIF, GIF; and their EXIF."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,10 +11,13 @@ import pytest
 from PIL import Image
 
 from hm_sfm.colmap.cameras import make_cameras
+from hm_sfm.colmap.database import open_database, write_database
 from hm_sfm.config import CameraConfig
 from hm_sfm.errors import InputError, MissingPackageError
+from hm_sfm.pairs.selection import pair_spatially
 from hm_sfm.photos.bitmaps import open_to_colmap, read_bitmap
 from hm_sfm.photos.images import list_images, prepare_image, read_ref
+from hm_sfm.types import Keypoints
 
 
 def textured(width: int, height: int) -> np.ndarray:
@@ -30,8 +34,8 @@ def write_photo(path: Path, stored: np.ndarray, orientation: int = 1) -> Path:
     exif[0x8769] = {0xA405: 28}
     exif[0x8825] = {1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 45.0, 0.0), 5: b"\0", 6: 512.5}
     image = Image.fromarray(stored)
-    if path.suffix.lower() == ".jpg":
-        image.save(path, exif=exif, quality=98)
+    if path.suffix.lower() not in (".heic", ".heif"):
+        image.save(path, "JPEG" if path.suffix == ".jpe" else None, exif=exif, quality=98)
     else:
         pillow_heif.from_pillow(image).save(path, quality=98, exif=exif.tobytes())
     return path
@@ -84,6 +88,42 @@ def test_a_jpeg_that_is_named_heic_is_read_as_what_it_is(tmp_path):
     assert prepare_image(photo, 320).scaled_wh == (240, 320)
 
 
+def test_heic_that_is_named_jpg_is_read_as_what_it_is(tmp_path, monkeypatch, caplog):
+    write_photo(tmp_path / "a.heic", textured(320, 240), 6).rename(tmp_path / "a.jpg")
+    (photo,) = list_images(tmp_path).images
+    assert (photo.size_wh, photo.rotation_deg) == ((240, 320), 0) and prepare_image(photo, 320).scaled_wh == (240, 320)
+    write_photo(tmp_path / "b.jpg", textured(320, 240))
+    monkeypatch.setattr("hm_sfm.photos.bitmaps.can_read_heic", lambda: False)
+    listing = list_images(tmp_path)
+    assert [photo.name for photo in listing.images] == ["b.jpg"]
+    assert caplog.messages == [f"skipped: {listing.skipped[0][1]}"] and "a.jpg is HEIC" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["a.webp", "a.avif", "a.jpe", "a.jfif", "a.mpo", "a.gif", "a.jp2"])
+@pytest.mark.parametrize("orientation", [1, 5, 6])
+def test_other_kinds_of_photos(tmp_path, name, orientation):
+    stored = textured(320, 240)
+    write_photo(tmp_path / name, stored, orientation)
+    write_photo(tmp_path / "b.jpg", stored, orientation)
+    photo, jpeg = list_images(tmp_path).images
+    assert photo.size_wh == (320, 240)
+    if name not in ("a.gif", "a.jp2"):  # they have no EXIF
+        assert (photo.gps, photo.rotation_deg, photo.mirrored) == (jpeg.gps, jpeg.rotation_deg, jpeg.mirrored)
+        assert len(make_cameras([photo, jpeg], CameraConfig()).cameras) == 1
+    expected = cv2.cvtColor(stored, cv2.COLOR_RGB2GRAY) / 255
+    shown = prepare_image(replace(photo, rotation_deg=0, mirrored=False), 320).grey
+    assert np.abs(shown - expected).mean() < 0.04
+    with open_to_colmap([photo], tmp_path) as folder:
+        seen = pycolmap.Bitmap.read(folder / photo.name, as_rgb=True).to_array()
+    assert np.abs(seen[:, :: -1 if photo.flipped else 1].astype(float) - stored).mean() < 15
+
+
+def test_exif_that_pillow_cannot_write_again_loses_no_photo(tmp_path):
+    image = Image.fromarray(textured(64, 48))
+    image.save(tmp_path / "a.webp", exif=b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + bytes(range(200)))
+    assert read_ref(tmp_path / "a.webp").size_wh == (64, 48)
+
+
 def test_damaged_heic_is_skipped(tmp_path, capfd):
     whole = write_photo(tmp_path / "good.heic", textured(320, 240)).read_bytes()
     for name, data in {"cut": whole[:-10], "half": whole[: len(whole) // 2], "empty": b"", "text": b"no image"}.items():
@@ -128,6 +168,38 @@ def test_colmap_gets_files_that_it_can_read(tmp_path):
     assert not folder.exists() and folder != tmp_path
     with open_to_colmap(images[:1], tmp_path) as folder:
         assert folder == tmp_path  # nothing to do
+
+
+def test_colmap_gets_mirrored_photos_flipped_and_thermal_ones_in_grey(tmp_path):
+    stored = textured(64, 48)
+    write_photo(tmp_path / "a.jpg", stored, 7)
+    grey = cv2.cvtColor(stored, cv2.COLOR_RGB2GRAY)
+    cv2.imwrite(str(tmp_path / "b.tif"), 280 + grey.astype(np.float32) / 10)
+    images = list_images(tmp_path).images
+    with open_to_colmap(images, tmp_path) as folder:
+        bitmaps = [pycolmap.Bitmap.read(folder / image.name, as_rgb=True) for image in images]
+    assert np.abs(bitmaps[0].to_array()[:, ::-1].astype(int) - stored).mean() < 4
+    assert bitmaps[0].exif_orientation() in (None, 1)
+    spread = (grey.astype(float) - np.percentile(grey, 0.5)) / np.ptp(np.percentile(grey, (0.5, 99.5)))
+    assert np.abs(bitmaps[1].to_array()[..., 0] - 255 * spread.clip(0, 1)).mean() < 3
+
+
+@pytest.mark.parametrize("altitude_m", [None, 512.5])
+def test_positions_without_altitude(tmp_path, altitude_m):
+    exif = Image.Exif()
+    exif[0x8825] = {1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 45.0, 0.0)}
+    if altitude_m:
+        exif[0x8825] |= {5: b"\0", 6: altitude_m}
+    for name in ("a.jpg", "b.jpg"):
+        Image.fromarray(textured(64, 48)).save(tmp_path / name, exif=exif)
+    images = list_images(tmp_path).images
+    assert images[0].gps == pytest.approx((-33.51, -70.75, altitude_m))
+    positions = {image.name: image.gps for image in images}
+    assert len(pair_spatially(positions, 1, 10.0)) == 1
+    none = [Keypoints(image.name, np.zeros((0, 2)), np.zeros(0), np.zeros(0)) for image in images]
+    write_database(tmp_path / "a.db", images, make_cameras(images, CameraConfig()), none, [])
+    with open_database(tmp_path / "a.db") as database:
+        assert database.num_pose_priors() == (2 if altitude_m else 0)
 
 
 def test_names_of_cameras_in_any_encoding(tmp_path):

@@ -16,6 +16,9 @@ from hm_sfm.colmap.database import write_database
 from hm_sfm.errors import InputError
 from hm_sfm.export.conversion import convert_run, flatten_names
 from hm_sfm.formats.pairs_files import write_pairs
+from hm_sfm.io.markers import MADE_MARKER
+from hm_sfm.photos.exif import write_jpeg
+from hm_sfm.photos.images import list_images
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 WIDTH, HEIGHT = 320, 240
@@ -77,7 +80,7 @@ def test_3dgs_gets_pinhole_cameras_and_images_that_fit_them(out, tmp_path):
     source = pycolmap.Reconstruction(out / "sparse" / "0")
     assert (model.num_reg_images(), model.num_points3D()) == (4, source.num_points3D())
     assert list_files(tmp_path / "3dgs" / "images") == {image.name for image in model.images.values()}
-    assert {path.name for path in (tmp_path / "3dgs").iterdir()} == {"images", "sparse"}
+    assert {path.name for path in (tmp_path / "3dgs").iterdir()} == {"images", "sparse", MADE_MARKER}
     assert model.compute_mean_reprojection_error() == pytest.approx(source.compute_mean_reprojection_error(), abs=1e-3)
     (camera,) = model.cameras.values()
     assert camera.model == pycolmap.CameraModelId.PINHOLE
@@ -117,6 +120,24 @@ def test_3dgs_of_cameras_without_distortion(tmp_path, model, params):
     assert camera.model == pycolmap.CameraModelId.PINHOLE
     assert camera.params.tolist() == [300, params[-3] if model == "PINHOLE" else 300, 160, 120]
     np.testing.assert_allclose(find_disc(tmp_path / "3dgs" / "images" / "right_1.png"), DISC_PX, atol=0.1)
+
+
+@pytest.mark.parametrize("to", ["3dgs", "nerfstudio"])
+def test_undistorted_copies_beside_the_photos_are_no_photos(out, tmp_path, to, caplog):
+    convert_run(out, to, tmp_path / "photos" / "converted")
+    assert {image.name for image in list_images(tmp_path / "photos").images} == set(NAMES)
+    assert caplog.messages == [f"left out: the folder {tmp_path / 'photos' / 'converted'} was made by hm_sfm"]
+    assert len(list_images(tmp_path / "photos" / "converted" / "images").images) == 4
+
+
+def test_mirrored_photos_are_undistorted_as_the_model_sees_them(tmp_path):
+    names = ("1.jpg", "2.jpg")
+    out = make_run(tmp_path, "SIMPLE_RADIAL", [300.0, 160.0, 120.0, 0.08], names)
+    stored = cv2.imread(str(tmp_path / "photos" / names[0]))
+    write_jpeg(tmp_path / "photos" / names[1], stored[:, ::-1].copy(), None, orientation=2)
+    convert_run(out, "3dgs", tmp_path / "3dgs")
+    discs = [find_disc(tmp_path / "3dgs" / "images" / name) for name in names]
+    np.testing.assert_allclose(discs[0], discs[1], atol=0.3)
 
 
 def test_flat_names_differ_where_case_does_not_count():
@@ -269,7 +290,7 @@ def test_what_colmap_cannot_undistort(tmp_path, to):
     model = pycolmap.Reconstruction(out / "sparse" / "0")
     next(image for image in model.images.values() if image.name == "2.webp").name = "2.HEIC"
     model.write_binary(out / "sparse" / "0")
-    with pytest.raises(InputError, match="cannot undistort HEIC and WebP photos, such as .*: convert the 2 of them to"):
+    with pytest.raises(InputError, match=r"cannot undistort photos of the kind of .*2.HEIC: convert the 2 of them to"):
         convert_run(out, to, tmp_path / "target")
     convert_run(out, "txt", tmp_path / "txt")
     assert not (tmp_path / "target").exists() and (tmp_path / "txt" / "images.txt").exists()
@@ -277,7 +298,7 @@ def test_what_colmap_cannot_undistort(tmp_path, to):
 
 def test_a_photo_that_cannot_be_read(out, tmp_path, capfd):
     (tmp_path / "photos" / NAMES[1]).write_bytes(b"no image")
-    with pytest.raises(InputError, match=f"cannot undistort 1 of 4 photos, for example .*{NAMES[1]}"):
+    with pytest.raises(InputError, match=f"{NAMES[1]} cannot be decoded as an image"):
         convert_run(out, "3dgs", tmp_path / "3dgs")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "photos"]
     assert capfd.readouterr().err == ""

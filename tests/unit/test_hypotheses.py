@@ -26,7 +26,8 @@ from hm_sfm.matching.hypotheses import (
 )
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.photos.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
-from hm_sfm.photos.images import CV_ROTATIONS, prepare_array, prepare_image, read_ref, read_rgb
+from hm_sfm.photos.images import prepare_array, prepare_image, read_ref, read_rgb
+from hm_sfm.photos.orientation import CV_ROTATIONS
 from hm_sfm.synthetic.textures import MATERIALS, make_texture
 from hm_sfm.types import ImagePair, PatchMatches
 

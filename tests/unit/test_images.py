@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hm_sfm.errors import ConfigError, InputError
-from hm_sfm.photos.images import ImageList, list_images, prepare_array, prepare_image, read_ref
+from hm_sfm.photos.images import ImageList, list_images, prepare_array, prepare_image, read_ref, read_rgb
 
 # 48 x 32 px, the left upper quarter 220, the rest 40; OpenCV cannot write CMYK.
 CMYK_JPEG = base64.b64decode(
@@ -48,13 +48,13 @@ def with_exif(jpeg: bytes, orientation: int, thumbnail: bytes = b"") -> bytes:
     return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload + jpeg[2:]
 
 
-def grey_tiff(image: np.ndarray, orientation: int) -> bytes:
+def grey_tiff(image: np.ndarray, orientation: int, sample_format: int = 1) -> bytes:
     height, width = image.shape
-    tags = [(256, width), (257, height), (258, 8), (259, 1), (262, 1), (273, 8), (274, orientation), (277, 1)]
-    tags += [(278, height), (279, image.size)]
+    tags = [(256, width), (257, height), (258, 8 * image.itemsize), (259, 1), (262, 1), (273, 8), (274, orientation)]
+    tags += [(277, 1), (278, height), (279, image.nbytes), (339, sample_format)]
     entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
     directory = struct.pack("<H", len(tags)) + entries + struct.pack("<I", 0)
-    return b"II*\0" + struct.pack("<I", 8 + image.size) + image.tobytes() + directory
+    return b"II*\0" + struct.pack("<I", 8 + image.nbytes) + image.tobytes() + directory
 
 
 def write(path: Path, data: bytes) -> Path:
@@ -154,12 +154,40 @@ def test_bytes_after_the_end_of_an_image_are_accepted(tmp_path):
     assert listing.skipped == () and len(listing.images) == 5
 
 
-def test_a_kind_that_only_opencv_reads_says_what_to_do(tmp_path):
-    write(tmp_path / "a.bmp", encode(textured(64, 48), ".ras"))  # Sun's format, under another name
-    write(tmp_path / "b.png", encode(textured(64, 48), ".png"))
+def test_photos_of_kinds_that_nothing_reads_are_named(tmp_path, caplog):
+    for name in ("a.jxl", "b.CR2", "sub/c.dng"):
+        write(tmp_path / name, encode(textured(64, 48), ".tif"))  # raw photos hold small TIFFs
+    with pytest.raises(InputError, match="holds 3 images but none can be used.*convert it to JPEG"):
+        list_images(tmp_path)
+    write(tmp_path / "d.png", encode(textured(64, 48), ".png"))
+    caplog.clear()
     listing = list_images(tmp_path)
-    assert [ref.name for ref in listing.images] == ["b.png"]
-    assert "COLMAP cannot read: convert it to JPEG or PNG" in skipped_reason(listing, "a.bmp")
+    assert [ref.name for ref in listing.images] == ["d.png"]
+    assert [name for name, _ in listing.skipped] == ["a.jxl", "b.CR2", "sub/c.dng"]
+    assert caplog.messages == [f"skipped: {reason}" for _, reason in listing.skipped]
+
+
+def damage(jpeg: bytes, kind: str) -> bytes:
+    """As a failing card does it, or as a motion photo whose scan ends early, before its video."""
+    half = len(jpeg) // 2
+    if kind == "zeros":
+        return jpeg[:half] + bytes(400) + jpeg[half + 400 :]
+    if kind == "noise":
+        return jpeg[:half] + np.random.default_rng(0).bytes(400).replace(b"\xff", b"\0") + jpeg[half + 400 :]
+    return jpeg[:half] + b"\0\0\0\x18ftypmp42" + bytes(range(256)) * 4 + b"\xff\xd9" + b"x" * 100
+
+
+@pytest.mark.parametrize("kind", ["zeros", "noise", "video"])
+def test_jpegs_that_are_damaged_inside_are_used_with_a_warning(tmp_path, caplog, capfd, kind):
+    jpeg = encode(textured(320, 240))
+    write(tmp_path / "a.jpg", damage(jpeg, kind))
+    write(tmp_path / "b.jpg", jpeg + b"a video")
+    listing = list_images(tmp_path)
+    assert [ref.name for ref in listing.images] == ["a.jpg", "b.jpg"]
+    (message,) = caplog.messages
+    assert message.startswith(f"{tmp_path / 'a.jpg'} is damaged, parts of it show nothing or something wrong: Corrupt")
+    assert prepare_image(listing.images[0], 320).grey.shape == (240, 320)
+    assert capfd.readouterr().err == ""  # no word of libjpeg, which names no file
 
 
 @pytest.mark.parametrize("name", ["line\nbreak.png", b"latin-\xe9.png".decode("utf-8", "surrogateescape")])
@@ -196,29 +224,52 @@ def test_read_ref_names_an_image_after_its_file(tmp_path):
         read_ref(tmp_path / "gone.png")
 
 
+# Where a point (x, y) of a stored photo of W x H px is shown, by EXIF's definition.
+SHOWN_AT = {
+    1: lambda x, y, w, h: (x, y),
+    2: lambda x, y, w, h: (w - x, y),
+    3: lambda x, y, w, h: (w - x, h - y),
+    4: lambda x, y, w, h: (x, h - y),
+    5: lambda x, y, w, h: (y, x),
+    6: lambda x, y, w, h: (h - y, x),
+    7: lambda x, y, w, h: (h - y, w - x),
+    8: lambda x, y, w, h: (y, w - x),
+}
+
+
 @pytest.mark.parametrize("orientation", range(10))
 @pytest.mark.parametrize("kind", ["jpg", "tif"])
-def test_turned_photos_come_upright_and_their_points_go_back(tmp_path, orientation, kind):
-    # 0 and 9 are not orientations. The expected positions are EXIF's definition: which side of the stored image is up.
-    xy = (150.0, 40.0)
+def test_turned_and_mirrored_photos_come_upright_and_their_points_go_back(tmp_path, orientation, kind):
+    xy = (190.0, 40.0)
     stored = spotted(300, 200, xy, sigma=8)
     data = with_exif(encode(stored, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 98), orientation)
     path = write(tmp_path / f"a.{kind}", data if kind == "jpg" else grey_tiff(stored, orientation))
     ref = read_ref(path)
-    assert ref.size_wh == (300, 200)
+    assert ref.size_wh == (300, 200) and not ref.flipped
     assert ref.rotation_deg == {3: 180, 4: 180, 5: 90, 6: 90, 7: 270, 8: 270}.get(orientation, 0)
+    assert ref.mirrored == (orientation in (2, 4, 5, 7))
 
     prepared = prepare_image(ref, 150)
 
-    upright = {0: (75, 20), 90: (80, 75), 180: (75, 80), 270: (20, 75)}[ref.rotation_deg]
-    assert prepared.scaled_wh == ((150, 100) if ref.rotation_deg in (0, 180) else (100, 150))
+    shown_at = SHOWN_AT.get(orientation, SHOWN_AT[1])  # 0 and 9 are no orientations
+    assert prepared.scaled_wh == ((150, 100) if orientation < 5 or orientation == 9 else (100, 150))
     assert prepared.grey.shape == prepared.scaled_wh[::-1]
     spot = spot_of(np.where(prepared.grey > 0.1, prepared.grey, 0))
-    np.testing.assert_allclose(spot, upright, atol=0.05)
+    np.testing.assert_allclose(spot, shown_at(95, 20, 150, 100), atol=0.05)
     np.testing.assert_allclose(prepared.stored_from_scaled @ [*spot, 1], [*xy, 1], atol=0.1)
+    colours = np.rint(prepared.grey * 255)[..., None]
+    np.testing.assert_allclose(read_rgb(prepared) - colours, 0, atol=1)
+    # In a run, points are those of the photo flipped left to right: its camera is then one of COLMAP's.
+    (listed,) = list_images(tmp_path).images
+    assert listed.flipped == ref.mirrored
+    in_run = prepare_image(listed, 150)
+    assert np.array_equal(in_run.grey, prepared.grey)
+    expected = (300 - xy[0], xy[1], 1) if ref.mirrored else (*xy, 1)
+    np.testing.assert_allclose(in_run.stored_from_scaled @ [*spot, 1], expected, atol=0.1)
+    assert np.linalg.det(in_run.stored_from_scaled) > 0
 
 
-@pytest.mark.parametrize("orientation", [3, 6, 8])
+@pytest.mark.parametrize("orientation", range(1, 9))
 def test_turning_agrees_with_opencv(tmp_path, orientation):
     path = write(tmp_path / "a.jpg", with_exif(encode(textured(120, 80)), orientation))
     prepared = prepare_image(read_ref(path), 1024)
@@ -322,12 +373,44 @@ def test_prepare_image_refuses_files_that_changed_since_they_were_listed(tmp_pat
         prepare_image(ref, 1024)
 
 
-def test_damage_inside_a_whole_looking_png_raises_at_reading(tmp_path):
+def test_damage_inside_a_whole_looking_png_is_found_when_it_is_listed(tmp_path, capfd):
     data = bytearray(encode(textured(200, 100), ".png"))
     data[len(data) // 2] ^= 0xFF
-    ref = read_ref(write(tmp_path / "a.png", bytes(data)))
-    with pytest.raises(InputError, match="a.png cannot be decoded"):
-        prepare_image(ref, 1024)
+    path = write(tmp_path / "a.png", bytes(data))
+    with pytest.raises(InputError, match="a.png is cut short or cannot be decoded"):
+        read_ref(path)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize(
+    ("dtype", "low", "high"), [("f4", 280, 320), ("f8", -20, 60), ("i4", 1000, 90_000), ("u2", 7000, 9000)]
+)
+def test_tiffs_of_thermal_cameras(tmp_path, dtype, low, high, orientation):
+    grey = textured(64, 48).astype(float) / 255
+    values = (low + (high - low) * grey).astype(dtype)
+    kind = {"f": 3, "u": 1, "i": 2}[dtype[0]]
+    path = write(tmp_path / "a.tif", grey_tiff(values, orientation, sample_format=kind))
+    prepared = prepare_image(read_ref(path), 1024)
+    back = np.rint(prepared.stored_from_scaled @ [0.5, 0.5, 1] - [0.5, 0.5, 0]).astype(int)
+    if dtype == "u2":
+        assert prepared.grey[0, 0] == pytest.approx(values[back[1], back[0]] / 65535, abs=1e-6)
+        return
+    black, white = np.percentile(values, (0.5, 99.5))
+    expected = ((values - black) / (white - black)).clip(0, 1)
+    assert prepared.grey[0, 0] == pytest.approx(expected[back[1], back[0]], abs=1e-4)
+    np.testing.assert_allclose(np.sort(prepared.grey, axis=None), np.sort(expected, axis=None), atol=1e-4)
+    assert np.abs(read_rgb(prepared)[..., 1] - prepared.grey * 255).max() <= 1
+
+
+def test_values_that_are_no_numbers_are_black(tmp_path):
+    values = np.full((48, 64), np.nan, np.float32)
+    path = write(tmp_path / "a.tif", grey_tiff(values, 1, sample_format=3))
+    assert not prepare_image(read_ref(path), 64).grey.any()
+    values[10:30] = textured(64, 20)
+    write(path, grey_tiff(values, 1, sample_format=3))
+    grey = prepare_image(read_ref(path), 64).grey
+    assert not grey[:10].any() and grey[10:30].min() == 0 and grey[10:30].max() == 1
 
 
 def test_an_impossible_matching_size_is_a_configuration_error():

@@ -1,5 +1,6 @@
 """Masks: which pixels they hide, where they are looked for, and what does not fit."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -50,6 +51,16 @@ def test_exactly_the_black_pixels_are_hidden(tmp_path, images, hidden):
         assert masked.tolist() == [list(hidden)]
     assert not masks.hides("a/b.png", grid).any()
     assert masks.hides("a/b.jpg", np.zeros((0, 2))).shape == (0,)
+
+
+def test_the_mask_of_a_mirrored_photo_is_that_of_the_stored_pixels(tmp_path, images):
+    mirrored = [replace(images[0], mirrored=True, flipped=True), *images[1:]]
+    write_mask(tmp_path / "masks" / "a/b.jpg.png", make_mask((2, 1)))
+    camera = write_mask(tmp_path / "camera.png", make_mask((0, 4)))
+    masks = read_masks(mirrored, MaskConfig(folder=str(tmp_path / "masks"), camera=str(camera)))
+    grid = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=-1).reshape(-1, 2)
+    hidden = [grid[masks.hides(name, grid + 0.5)].tolist() for name in NAMES[:2]]
+    assert hidden == [[[WIDTH - 3, 1], [WIDTH - 1, 4]], [[0, 4]]]
 
 
 def test_points_outside_of_the_image_take_the_nearest_pixel(tmp_path, images):

@@ -24,7 +24,8 @@ from hm_sfm.pairs.retrieval import (
     weigh_words,
 )  # fmt: skip
 from hm_sfm.pairs.selection import select_pairs
-from hm_sfm.photos.images import CV_ROTATIONS, prepare_array, read_ref
+from hm_sfm.photos.images import prepare_array, read_ref
+from hm_sfm.photos.orientation import CV_ROTATIONS
 from hm_sfm.pipeline.collection import choose_pairs
 from hm_sfm.synthetic.textures import make_texture
 from hm_sfm.types import ImageRef

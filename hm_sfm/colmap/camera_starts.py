@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from hm_sfm.colmap.cameras import guess_focal_px
+from hm_sfm.colmap.cameras import FOCAL_RATIOS, guess_focal_px
 from hm_sfm.colmap.database import open_database
-from hm_sfm.colmap.model_judgement import FOCAL_RATIOS
 
 WIDER, LONGER = 0.6, 1.8
 """Guesses of focal lengths beside the first one, relative to it."""

@@ -1,9 +1,10 @@
 """Cameras of the photos: which of them share one, and its intrinsics, from EXIF or from the user."""
 
 import difflib
+import logging
 import math
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 import pycolmap
@@ -15,12 +16,15 @@ from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.photos.bitmaps import read_bitmap, read_camera_label
 from hm_sfm.types import ImageRef
 
+logger = logging.getLogger(__name__)
+
 # The first guess of a focal length that nothing is known about, relative to the longer side. COLMAP's 1.2 is too long
 # for most phones and videos, which have 0.5 to 1.1: adjustment of a flat scene may then run off to a telephoto lens.
 DEFAULT_FOCAL_RATIO = 0.9
-# For fisheye lenses, whose pixels are angles: the longer side then spans 140 degrees. No lens is so long that its view
-# is like that of others, and from 180 to 100 degrees adjustment finds the right one.
+# For fisheye lenses, whose pixels are angles: the longer side then spans 140 degrees.
 DEFAULT_FISHEYE_RATIO = 0.41
+# Focal lengths beyond these, relative to the longer side (views of 157 and 6 degrees), are refused by COLMAP's mapper.
+FOCAL_RATIOS = (0.1, 10.0)
 
 
 @dataclass(frozen=True)
@@ -51,11 +55,11 @@ def make_cameras(images: Sequence[ImageRef], config: CameraConfig) -> Cameras:
     """Decide which images share a camera, and set its intrinsics (px of the stored image, COLMAP's frame).
 
     Modes: `single`, `per-folder` and `per-image` say it all. `auto` takes one camera where all images agree in size
-    and EXIF lens (or have none), and otherwise one per folder, size and lens. The focal length comes from EXIF, or is
-    0.9 times the longer side, to be refined. `config.params` are known intrinsics for every camera; EXIF is then not
-    read. `config.file` and `config.poses` name a COLMAP model that has them; it also says which images share a camera.
-    `config.rig` names a rig configuration: each camera of a rig is then a camera for itself; its intrinsics, where the
-    configuration has them, are refined.
+    and EXIF lens (or have none), and otherwise one per folder, size and lens. The focal length comes from EXIF, except
+    for impossible ones, which are ignored with a warning, or is guess_focal_px; it is refined. `config.params` are
+    known intrinsics for every camera; EXIF is then not read. `config.file` and `config.poses` name a COLMAP model that
+    has them; it also says which images share a camera. `config.rig` names a rig configuration: each camera of a rig is
+    then a camera for itself; its intrinsics, where the configuration has them, are refined.
 
     Raises ConfigError on an unknown model, on unusable params, where intrinsics are given twice and where other
     settings contradict the rigs; InputError where images that have to share a camera differ in size, where an image
@@ -70,7 +74,7 @@ def make_cameras(images: Sequence[ImageRef], config: CameraConfig) -> Cameras:
         return _take_cameras(images, config, rigs, taken_by)
     model = _parse_model(config.model)
     params = _parse_params(config.params, model)
-    exif = [_ExifFocal(None, None) if params else _read_exif_focal(image) for image in images]
+    exif = [_ExifFocal(None, None)] * len(images) if params else _read_exif_focals(images)
 
     groups: dict[Hashable, list[int]] = {}
     for index, key in enumerate(_camera_keys(images, exif, config.mode, known=bool(params))):
@@ -164,6 +168,30 @@ def _camera_keys(images: Sequence[ImageRef], exif: Sequence[_ExifFocal], mode: s
     if known or len(set(lenses)) == 1:
         return [None] * len(images)
     return list(zip(folders, lenses))
+
+
+def _read_exif_focals(images: Sequence[ImageRef]) -> list[_ExifFocal]:
+    """What EXIF tells, without focal lengths that are impossible: these are ignored with a warning."""
+    exif = [_read_exif_focal(image) for image in images]
+    low, high = FOCAL_RATIOS
+    wrong = [
+        index
+        for index, (image, focal) in enumerate(zip(images, exif))
+        if focal.focal_px and not low < focal.focal_px / max(image.size_wh) < high
+    ]
+    if wrong:
+        image = images[wrong[0]]
+        logger.warning(
+            "the focal length in EXIF is ignored for %d of %d photos, because no lens has it: %.4g px for %s (%s)",
+            len(wrong),
+            len(images),
+            exif[wrong[0]].focal_px,
+            image.name,
+            _size(image),
+        )
+    for index in wrong:
+        exif[index] = replace(exif[index], focal_px=None)
+    return exif
 
 
 def _read_exif_focal(image: ImageRef) -> _ExifFocal:

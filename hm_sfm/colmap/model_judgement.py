@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
+from hm_sfm.colmap.cameras import FOCAL_RATIOS
 from hm_sfm.colmap.models import list_observations
 
-# The limits of COLMAP's mapper, which the last adjustment of a model may leave: focal lengths relative to the longer
-# side (views of 157 and 6 degrees), and the coefficients of distortion.
-FOCAL_RATIOS = (0.1, 10.0)
+# The limit of COLMAP's mapper for the coefficients of distortion, which the last adjustment of a model may leave.
 MAX_DISTORTION = 1.0
 
 # Right models agree with 99.5 to 100 % of the matches of their median pair, models with wrong cameras with 70 to 96 %.

@@ -74,7 +74,8 @@ def verify_pair(
 
     camera0, camera1: of image 0 and 1; where both have a known focal length, the geometry is calibrated. Pairs that
     see a plane, or that only rotate, are valid: matches then agree with a homography, or with an essential matrix, for
-    which unknown focal lengths are taken as the cameras have them.
+    which unknown focal lengths are taken as the cameras have them. So are those of fisheye lenses, whose images have no
+    fundamental matrix.
     px_scale: of image 0 and 1, px of the stored image per px at the matching resolution.
 
     Returns (M,) bool, the same for the same seed; all False where fewer than `config.min_inliers` or a smaller part
@@ -86,6 +87,8 @@ def verify_pair(
     xy0 = matches.xy0.astype(np.float64) / px_scale[0]
     xy1 = matches.xy1.astype(np.float64) / px_scale[1]
     cameras = [scale_camera(camera, scale) for camera, scale in zip((camera0, camera1), px_scale)]
+    for camera in cameras:
+        camera.has_prior_focal_length |= camera.is_perspective_fisheye()
     kind, inliers = _find_inliers(xy0, xy1, cameras, config.max_error_px, seed)
     if kind in PLANAR_KINDS and not all(camera.has_prior_focal_length for camera in cameras):
         # COLMAP then looks for a homography only. Any focal length will do for an essential matrix of the plane and
@@ -220,14 +223,18 @@ def verify_database(
     verify = partial(_verify_missing, config=config, seed=seed, num_threads=num_threads)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
         copy = Path(folder) / "copy.db"
-        if needs_scaling(px_scale):
+        fisheye = _list_unfocused_fisheye(path)
+        if fisheye or needs_scaling(px_scale):
             copy_scaled(path, copy, px_scale)
+            _claim_focal_lengths(copy, fisheye)
             verify(copy)
             _copy_geometries(copy, path, px_scale)
         else:
             verify(path)
-        if planar := _list_unfocused_planar(path):
+        planar, cameras = _list_unfocused_planar(path)
+        if planar:
             copy_scaled(path, copy, px_scale)
+            _claim_focal_lengths(copy, [*cameras, *fisheye])
             _forget(copy, planar)
             verify(copy)
             _add_inliers(copy, path, planar)
@@ -253,24 +260,38 @@ def _copy_geometries(copy: Path, path: Path, px_scale: Mapping[str, float]) -> N
             database.write_two_view_geometry(id0, id1, geometry)
 
 
-def _list_unfocused_planar(path: Path) -> list[tuple[int, int]]:
-    """The image ids of the pairs whose geometry is planar and was estimated without focal lengths."""
+def _list_unfocused_planar(path: Path) -> tuple[list[tuple[int, int]], list[int]]:
+    """The pairs (ids of images) whose geometry is planar and was estimated without focal lengths, and their cameras."""
     with open_database(path) as database:
-        unknown = {camera.camera_id for camera in database.read_all_cameras() if not camera.has_prior_focal_length}
+        cameras = database.read_all_cameras()
+        unknown = {c.camera_id for c in cameras if not c.has_prior_focal_length and not c.is_perspective_fisheye()}
         images = {image.image_id for image in database.read_all_images() if image.camera_id in unknown}
         rows = zip(*database.read_two_view_geometries())
         planar = [pycolmap.pair_id_to_image_pair(row) for row, geometry in rows if geometry.config in PLANAR_KINDS]
-    return [pair for pair in planar if images.intersection(pair)]
+    return [pair for pair in planar if images.intersection(pair)], sorted(unknown)
+
+
+def _list_unfocused_fisheye(path: Path) -> list[int]:
+    """The ids of the fisheye cameras without a known focal length."""
+    with open_database(path) as database:
+        cameras = database.read_all_cameras()
+    return [c.camera_id for c in cameras if c.is_perspective_fisheye() and not c.has_prior_focal_length]
+
+
+def _claim_focal_lengths(path: Path, camera_ids: Sequence[int]) -> None:
+    """Take the focal lengths of these cameras for known."""
+    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
+        for camera_id in camera_ids:
+            camera = database.read_camera(camera_id)
+            camera.has_prior_focal_length = True
+            database.update_camera(camera)
 
 
 def _forget(path: Path, pairs: Sequence[tuple[int, int]]) -> None:
-    """Remove two-view geometries, and claim that all focal lengths are known."""
+    """Remove two-view geometries."""
     with open_database(path) as database, pycolmap.DatabaseTransaction(database):
         for pair in pairs:
             database.delete_two_view_geometry(*pair)
-        for camera in database.read_all_cameras():
-            camera.has_prior_focal_length = True
-            database.update_camera(camera)
 
 
 def _add_inliers(copy: Path, path: Path, pairs: Sequence[tuple[int, int]]) -> None:

@@ -725,6 +725,42 @@ def test_a_dominant_plane_does_not_cost_what_stands_before_it(prior):
     assert inliers.all() or not prior
 
 
+def make_fisheye_pair() -> tuple[PairMatches, pycolmap.Camera]:
+    """Matches all over two fisheye images of 130 degrees, a tenth wrong, and the first guess of their camera."""
+    rng = np.random.default_rng(0)
+    true = pycolmap.Camera.create_from_model_name(1, "OPENCV_FISHEYE", 211.0, 480, 360)
+    guess = pycolmap.Camera.create_from_model_name(1, "OPENCV_FISHEYE", 0.41 * 480, 480, 360)
+    directions = rng.normal(size=(3000, 3)) * [1.0, 1.0, 0.6]
+    points = directions[directions[:, 2] > 0.1] * rng.uniform(3, 9, ((directions[:, 2] > 0.1).sum(), 1))
+    angle = 0.2
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    other = points @ turn.T - [0.8, 0.1, 0.1]
+    xy0, xy1 = np.array(true.img_from_cam(points)), np.array(true.img_from_cam(other))
+    inside = np.all((xy0 > 0) & (xy0 < (480, 360)) & (xy1 > 0) & (xy1 < (480, 360)), axis=1) & (other[:, 2] > 0.1)
+    xy0, xy1 = xy0[inside][:400], xy1[inside][:400]
+    xy1[::10] = rng.uniform((0, 0), (480, 360), (40, 2))
+    return make_matches(xy0, xy1), guess
+
+
+def test_fisheye_pairs_are_verified_without_a_known_focal_length(tmp_path):
+    pair, camera = make_fisheye_pair()
+    right = np.arange(400) % 10 > 0
+    config = VerificationConfig()
+    mask = verify_pair(pair, camera, camera, config)
+    assert mask[right].mean() > 0.9 and mask[~right].mean() < 0.3
+
+    images = [ImageRef(name, Path(name), (480, 360)) for name in ("a.jpg", "b.jpg")]
+    keypoints = [Keypoints(i.name, xy, np.ones(400), np.ones(400)) for i, xy in zip(images, (pair.xy0, pair.xy1))]
+    matches = IndexMatches(pair.pair, np.repeat(np.arange(400)[:, None], 2, axis=1), np.ones(400))
+    path = tmp_path / "database.db"
+    write_database(path, images, Cameras((camera,), (0, 0)), keypoints, [matches])
+    verify_database(path, config, num_threads=1)
+    (inliers,) = read_verified_matches(path).values()
+    assert np.isin(np.flatnonzero(right), inliers[:, 0]).mean() > 0.9
+    with open_database(path) as database:
+        assert not database.read_all_cameras()[0].has_prior_focal_length
+
+
 def test_pairs_below_the_limits_are_rejected():
     pair, camera, right = make_pair(200, 0.3, True)
     count = int(right.sum())

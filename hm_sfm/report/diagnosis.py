@@ -44,11 +44,12 @@ ALL_PAIRS = "--pairs exhaustive"
 LARGER = "--set images.long_edge_px=1600"
 INTRINSICS = "known intrinsics: --camera-model and --camera-params"
 OWN_CAMERAS = "--camera-mode per-image"
+FISHEYE = "--camera-model OPENCV_FISHEYE if the lens is a fisheye"
 MASKS = "masks (--masks or --camera-mask) of what stays where it is in the frame"
 ADVICE = {
     Cause.UNPAIRED: (ALL_PAIRS,),
     Cause.FEW_MATCHES: (BETWEEN, ALL_PAIRS, LARGER),
-    Cause.DISAGREEING: (MASKS, BETWEEN, ALL_PAIRS, LARGER),
+    Cause.DISAGREEING: (MASKS, INTRINSICS, BETWEEN, ALL_PAIRS, LARGER, FISHEYE),
     Cause.OTHER_MODEL: (MASKS, BETWEEN, ALL_PAIRS),
     Cause.APART: (MASKS, BETWEEN, ALL_PAIRS),
     Cause.FEW_POINTS: (MASKS, BETWEEN, ALL_PAIRS, LARGER),
@@ -92,8 +93,10 @@ class Evidence:
     models: tuple[pycolmap.Reconstruction, ...]
     """The largest first."""
     config: Config
-    focal_known: dict[str, bool]
-    """Image name -> EXIF or the user gave the focal length."""
+    cameras: dict[str, pycolmap.Camera]
+    """By image name: the first guess of each, or what the user gave."""
+    cameras_known: bool
+    """Whether the user gave the intrinsics."""
 
     def partners(self, name: str) -> dict[str, np.ndarray]:
         """The images that have verified matches with image `name` -> (M,) int64 keypoints of `name`, most first."""
@@ -102,6 +105,13 @@ class Evidence:
             if name in (pair.name0, pair.name1):
                 keypoints_of[pair.name1 if name == pair.name0 else pair.name0] = matches[:, int(name == pair.name1)]
         return dict(sorted(keypoints_of.items(), key=lambda item: (-len(item[1]), item[0])))
+
+    def may_lack_intrinsics(self, name: str, cause: Cause) -> bool:
+        """Whether known intrinsics could help an image.
+
+        Pairs of other than fisheye lenses are verified without them.
+        """
+        return not self.cameras_known and (cause != Cause.DISAGREEING or self.cameras[name].is_perspective_fisheye())
 
     def stays_still(self, name: str) -> bool:
         """Whether most matches of most of an image's pairs stay where they are in the frame.
@@ -146,10 +156,8 @@ def diagnose(
         database_path=Path(database_path),
         models=tuple(models),
         config=config,
-        focal_known={
-            image.name: cameras.cameras[index].has_prior_focal_length
-            for image, index in zip(images, cameras.camera_index)
-        },
+        cameras={image.name: cameras.cameras[index] for image, index in zip(images, cameras.camera_index)},
+        cameras_known=cameras.known,
     )
     reasons_of: dict[Cause, dict[str, str]] = {}
     for name in missing:
@@ -162,8 +170,10 @@ def diagnose(
             cause, reason = explain_unregistered(name, evidence)
         else:
             cause, reason = explain_unmapped(name, evidence)
-        if INTRINSICS in ADVICE[cause] and not evidence.focal_known[name]:
-            reason += ", focal length unknown"
+        if INTRINSICS in ADVICE[cause] and evidence.may_lack_intrinsics(name, cause):
+            camera = evidence.cameras[name]
+            exif = f"{camera.mean_focal_length():.0f} px from EXIF"
+            reason += f", focal length {exif if camera.has_prior_focal_length else 'unknown'}"
         reasons_of.setdefault(cause, {})[name] = reason
     return tuple(
         Diagnosis(cause, reasons_of[cause], choose_advice(cause, list(reasons_of[cause]), evidence))
@@ -242,7 +252,8 @@ def choose_advice(cause: Cause, names: Sequence[str], evidence: Evidence) -> tup
         ALL_PAIRS: len(evidence.pairs) == count * (count - 1) // 2,
         LARGER: max(max(evidence.images[name].size_wh) for name in names) <= config.images.long_edge_px
         or config.images.long_edge_px >= 1600,
-        INTRINSICS: all(evidence.focal_known[name] for name in names),
+        INTRINSICS: not any(evidence.may_lack_intrinsics(name, cause) for name in names),
+        FISHEYE: evidence.cameras_known or all(evidence.cameras[name].is_perspective_fisheye() for name in names),
         MASKS: not any(evidence.stays_still(name) for name in names),
         OWN_CAMERAS: config.cameras.mode == "per-image" or bool(config.cameras.rig),
     }

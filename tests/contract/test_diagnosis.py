@@ -120,6 +120,27 @@ def test_masks_are_advised_where_matches_stay_in_their_places(run):
     assert still.advice == ("masks (--masks or --camera-mask) of what stays where it is in the frame", *moving.advice)
 
 
+def test_matches_that_disagree_may_be_those_of_a_fisheye_lens(run):
+    last = run.names[-1]
+    run.deregister(last)
+    run.forget_pairs(last, run.names[:-1])
+    run.scores[ImagePair(run.names[0], last)] = 30
+    fisheye = "--camera-model OPENCV_FISHEYE if the lens is a fisheye"
+    (diagnosis,) = run.diagnose()
+    assert diagnosis.advice[-1] == fisheye and "--camera-params" not in str(diagnosis)
+
+    camera = pycolmap.Camera.create_from_model_name(1, "OPENCV_FISHEYE", 420.0, 1024, 768)
+    run.cameras = Cameras((camera,), (0,) * 4)
+    (diagnosis,) = run.diagnose()
+    assert diagnosis.reasons[last].endswith("too few of them agree, focal length unknown")
+    assert diagnosis.advice[0] == "known intrinsics: --camera-model and --camera-params"
+    assert fisheye not in diagnosis.advice
+
+    run.cameras = Cameras((camera,), (0,) * 4, known=True)
+    (diagnosis,) = run.diagnose()
+    assert "--camera-model" not in str(diagnosis)
+
+
 def test_an_image_of_another_model(run):
     whole = pycolmap.Reconstruction(run.model)
     run.deregister(run.names[2])
@@ -143,10 +164,18 @@ def test_points_of_the_model_in_view_are_counted(run):
     name = run.names[1]
     run.deregister(name)
     (diagnosis,) = run.diagnose()
-    assert (diagnosis.cause, diagnosis.reasons[name]) == (Cause.NO_POSE, "120 points of the model in view")
+    reason = "120 points of the model in view, focal length 1280 px from EXIF"
+    assert (diagnosis.cause, diagnosis.reasons[name]) == (Cause.NO_POSE, reason)
+    assert diagnosis.advice == ("known intrinsics: --camera-model and --camera-params", "--camera-mode per-image")
+
+    camera = run.cameras.cameras[0]
+    run.cameras = Cameras((camera,), (0,) * 4, known=True)
+    (diagnosis,) = run.diagnose()
+    assert diagnosis.reasons[name] == "120 points of the model in view"
     assert diagnosis.advice == ("--camera-mode per-image",)
 
-    run.cameras.cameras[0].has_prior_focal_length = False
+    run.cameras = Cameras((camera,), (0,) * 4)
+    camera.has_prior_focal_length = False
     (diagnosis,) = run.diagnose()
     assert diagnosis.reasons[name].endswith(", focal length unknown")
     assert "--camera-params" in diagnosis.advice[0]

@@ -65,7 +65,13 @@ def find_models(
     models = [*best.models, *leftovers]
     if best.start and models:
         os.replace(best.task.database, task.database)
-    return models if best.task.fix_intrinsics else _drop_impossible(models)
+    if best.task.fix_intrinsics:
+        return models
+    models = _drop_impossible(models)
+    if models and not best.models:
+        for camera_id in find_undetermined(models[0])[:1]:
+            _warn_of_undetermined(models[0].camera(camera_id))
+    return models
 
 
 def _try_starts(task: MappingTask, build: Build, work_folder: Path) -> Attempt:
@@ -111,12 +117,16 @@ def _keep_exif(best: Attempt, build: Build, folder: Path) -> Attempt:
         fixed = _attempt(replace(best.task, fix_intrinsics=True), None, build, folder)
         if fixed.is_good and fixed.explained * CLEAR_GAIN >= best.explained:
             return replace(fixed, start=best.start)
+    _warn_of_undetermined(best.models[0].camera(undetermined[0]))
+    return best
+
+
+def _warn_of_undetermined(camera: pycolmap.Camera) -> None:
     logger.warning(
         "the photos do not determine the focal length (%.0f px in the model): directions and heights may be wrong; add "
         "photos that look obliquely at the scene, or give it by --camera-model and --camera-params",
-        best.models[0].camera(undetermined[0]).mean_focal_length(),
+        camera.mean_focal_length(),
     )
-    return best
 
 
 def _attempt(task: MappingTask, start: CameraStart | None, build: Build, folder: Path) -> Attempt:

@@ -167,9 +167,10 @@ def open_to_colmap(images: Sequence[ImageRef], image_folder: Path) -> Iterator[P
 
     That is image_folder, where COLMAP can read them all and none is flipped. Otherwise it is a temporary one with
     symbolic links to the files, and with JPEGs in place of the others. These keep their names: COLMAP goes by the
-    content.
+    content. Photos that are gone are left to COLMAP, which gives their points no colour.
     """
-    copied = {image.name for image in images if image.flipped or not is_read_by_colmap(image.path)}
+    there = [image for image in images if image.path.is_file()]
+    copied = {image.name for image in there if image.flipped or not is_read_by_colmap(image.path)}
     if not copied:
         yield Path(image_folder)
         return

@@ -60,11 +60,12 @@ NO_MASKS = Masks()
 def read_masks(images: Sequence[ImageRef], config: MaskConfig) -> Masks:
     """The masks of the images: `config.folder` holds one per image, `config.camera` is one for all of its size.
 
-    Images without a mask in the folder are logged as a warning; they are not masked.
+    Images without a mask in the folder are logged as a warning; they are not masked. So are images that are hidden as a
+    whole.
 
     Raises InputError where the folder does not exist, holds no mask of any image, or holds photos of the collection;
-    where a mask cannot be read or differs from its image in size; and where no image has the size of the camera's mask
-    or the mask itself is among the images.
+    where a mask cannot be read or differs from its image in size; where no image has the size of the camera's mask or
+    the mask itself is among the images; and where nothing of any image is left.
     """
     visible: dict[str, np.ndarray] = {}
     if config.folder:
@@ -89,6 +90,16 @@ def read_masks(images: Sequence[ImageRef], config: MaskConfig) -> Masks:
         for image in of_its_size:
             own, packed = visible.get(image.name), _pack(_flip_as(image, shared))
             visible[image.name] = packed if own is None else own & packed
+    hidden = [name for name, packed in visible.items() if not packed.any()]
+    if hidden and len(hidden) == len(images):
+        raise InputError(f"the masks hide all pixels of all {len(images)} images: what is black is masked out")
+    if hidden:
+        logger.warning(
+            "%d of %d images are hidden as a whole, such as %s: what is black is masked out",
+            len(hidden),
+            len(images),
+            hidden[0],
+        )
     return Masks(visible)
 
 

@@ -1,6 +1,7 @@
 """The context stage as a provider: bad images, other weights, and what its matches are worth."""
 
 import dataclasses
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,9 +13,11 @@ from hm_sfm.config import MatchingConfig, NetworkConfig
 from hm_sfm.errors import WeightsError
 from hm_sfm.matching.encoder import Encoder
 from hm_sfm.matching.epipolar import agree_with, fit_fundamental
+from hm_sfm.matching.interfaces import ImageKeypoints
 from hm_sfm.matching.providers.weights import OtherContext, load_coarse
 from hm_sfm.network.checkpoints import find_weights, load_weights, save_weights
-from hm_sfm.photos.images import prepare_array
+from hm_sfm.photos.images import PreparedImage, prepare_array
+from hm_sfm.types import ImageRef
 
 CPU = torch.device("cpu")
 SHIFT = np.array([24.0, 8.0])
@@ -59,6 +62,12 @@ def test_the_score_is_no_more_than_the_probability_of_the_place(matcher, photos)
     assert known.sum() > 20 and np.all(matches.score[known] <= places[known] + 1e-5)
 
 
+def make_prepared(grey: np.ndarray) -> PreparedImage:
+    """As prepare_array does, of any size."""
+    size_wh = (grey.shape[1], grey.shape[0])
+    return PreparedImage(ImageRef("strip", Path("strip"), size_wh), grey / 255, size_wh, np.eye(3))
+
+
 def make_few_keypoints() -> np.ndarray:
     """A grey image with one dark square: hardly a keypoint."""
     image = np.full((200, 240), 140, np.uint8)
@@ -89,6 +98,25 @@ def test_a_photo_of_64_px_and_a_long_panorama(matcher, photos):
     panorama = np.tile(cv2.resize(photos[0], (500, 500)), (1, 40))
     matches = matcher.match(panorama, panorama)
     assert panorama.shape == (500, 20000) and np.isfinite(matches.xy1).all()
+
+
+def test_a_photo_of_a_few_rows(matcher, photos):
+    """What is left of a long panorama at the matching resolution."""
+    panorama = np.tile(cv2.resize(photos[0], (512, 26)), (1, 2))
+    for pair in ((panorama, panorama), (panorama, photos[0])):
+        features = [matcher.encode(make_prepared(image)) for image in pair]
+        assert np.isfinite(matcher.match_features(*features).xy1).all()
+
+
+@pytest.mark.parametrize(("count", "matched"), [(0, False), (1, False), (7, False), (8, True)])
+def test_images_with_hardly_a_keypoint_have_no_context(matcher, photos, count, matched):
+    """Below eight keypoints nothing is matched, whatever they look like."""
+    whole = matcher.encode(prepare_array(photos[0], 1024))
+    states = whole.keypoints.states.select(torch.arange(count))
+    few = dataclasses.replace(whole, keypoints=ImageKeypoints(whole.keypoints.xy[:count], states))
+    for pair in ((few, whole), (few, few)):
+        assert (len(matcher.provider.match(*pair)) > 0) == matched
+    assert np.isfinite(matcher.match_features(few, few).xy1).all()
 
 
 def test_memory_counts_the_keypoints(matcher, photos):

@@ -99,6 +99,18 @@ def test_a_camera_mask_is_that_of_all_images_of_its_size(tmp_path, images, caplo
     assert caplog.messages[1] == f"1 of 4 images are not of the size of the mask {camera}: it is not theirs"
 
 
+def test_images_that_are_hidden_as_a_whole(tmp_path, images, caplog):
+    """Masks are often the wrong way round: black where the object is."""
+    for name in NAMES:
+        write_mask(tmp_path / "masks" / f"{name}.png", make_mask((0, 0)))
+    write_mask(tmp_path / "masks" / f"{NAMES[1]}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    read_masks(images, MaskConfig(folder=str(tmp_path / "masks")))
+    assert caplog.messages == ["1 of 3 images are hidden as a whole, such as a/b.png: what is black is masked out"]
+    camera = write_mask(tmp_path / "black.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(InputError, match="hide all pixels of all 3 images: what is black is masked out"):
+        read_masks(images, MaskConfig(camera=str(camera)))
+
+
 def test_no_masks_hide_nothing(images):
     masks = read_masks(images, MaskConfig())
     assert masks == Masks() and not masks.hides("c.jpg", np.array([(1, 1)])).any()

@@ -115,11 +115,17 @@ class MatchingConfig:
         check_words(self, "matching")
 
 
+GOOD_SCORE = 0.5
+"""A match with at least this score is good: it is more probably off by less than 1 px than not. Matching counts good
+matches, and only these grow; it goes by this number and not by verification.min_score, whose default it is, so that
+stored matches stay when that setting changes."""
+
+
 @dataclass(frozen=True)
 class VerificationConfig:
     """Two-view geometry, before keypoints are propagated and again with the final keypoints."""
 
-    min_score: float = 0.5
+    min_score: float = GOOD_SCORE
     """Matches with a lower score are not used: they are probably off by more than 1 px of the matching resolution."""
     max_error_px: float = 3.0
     """Largest error of an inlier, px of the matching resolution; it is scaled to the photo."""

@@ -27,7 +27,7 @@ class LoftrImage:
 
     pixels: Tensor
     """(1, 1, H, W) float32 in [0, 1], padded to multiples of STRIDE."""
-    scaled_wh: tuple[int, int]
+    stored_wh: tuple[int, int]
     stored_from_scaled: np.ndarray
     """(3, 3) float64: px of the network's input -> px of the stored image."""
 
@@ -70,7 +70,7 @@ class LoftrMatcher:
     def encode(self, image: PreparedImage) -> LoftrImage:
         """A prepared image on the device."""
         pixels = pad_image(torch.tensor(image.grey, device=self.device), STRIDE, standardise=False)
-        return LoftrImage(pixels, image.scaled_wh, image.stored_from_scaled)
+        return LoftrImage(pixels, image.ref.size_wh, image.stored_from_scaled)
 
     @torch.inference_mode()
     def match_features(self, features0: LoftrImage, features1: LoftrImage) -> PatchMatches:
@@ -84,10 +84,7 @@ class LoftrMatcher:
         xy0 = output["keypoints0"].double().cpu().numpy() @ stored0[:2, :2].T + stored0[:2, 2]
         xy1 = output["keypoints1"].double().cpu().numpy() @ stored1[:2, :2].T + stored1[:2, 2]
         score = output["confidence"].float().cpu().numpy()
-        inside0, inside1 = (
-            is_inside(xy, features.scaled_wh, features.stored_from_scaled)
-            for xy, features in ((xy0, features0), (xy1, features1))
-        )
+        inside0, inside1 = is_inside(xy0, features0.stored_wh), is_inside(xy1, features1.stored_wh)
         inside = np.flatnonzero(inside0 & inside1)
         best = inside[np.argsort(-score[inside], kind="stable")][: self.config.max_matches]
         shift = np.tile(np.eye(3), (len(best), 1, 1))

@@ -1,24 +1,25 @@
 """Rotation and scale hypotheses, for pairs that match badly as they are: a photo on its side, or of another scale.
 
 The network's features depend on rotation and scale. So where two photos have few good matches, small sketches of them
-are compared, one rotated by quarter turns and either one reduced. Where one hypothesis stands out, the photos are
-matched again under it. Patches are then upright and of one scale: their homographies start from the relative rotation
-and scale, not from the identity. The points are still those of the stored photos.
+are compared, one rotated by quarter turns, then by angles between these, and either one reduced. Where one hypothesis
+stands out, the photos are matched again under it. Patches are then nearly upright and of one scale: their homographies
+start from the relative rotation and scale, not from the identity. The points are still those of the stored photos.
 """
 
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from hm_sfm.config import GOOD_SCORE
 from hm_sfm.matching.interfaces import CellMatcher, PairMatcher
-from hm_sfm.photos.hypotheses import IDENTITY, ROTATIONS_DEG, Hypothesis, apply_hypothesis
+from hm_sfm.matching.patches import is_inside
+from hm_sfm.photos.hypotheses import IDENTITY, ROTATIONS_DEG, TILTS_DEG, Hypothesis, apply_hypothesis
 from hm_sfm.photos.images import PreparedImage
 from hm_sfm.types import PatchMatches
 
-GOOD_SCORE = 0.5
-"""A match with at least this score, the probability of an error below 1 px, is a good one."""
 FEW_MATCHES = 500
 """Pairs with fewer good matches are compared as sketches: of rotated photos, a few hundred can be good by chance."""
 SKETCH_LONG_EDGE_PX = 384
@@ -32,7 +33,7 @@ LEAST_SUPPORT = 8
 LEAST_SHARE = 0.5
 """and at least this share of them, lie beside it in the other sketch, too."""
 ENOUGH_AGREEING = 40
-"""Where a rotation has so many agreeing matches, other scales are not compared."""
+"""Where a rotation has so many agreeing matches, other angles and scales are not compared."""
 LEAST_AGREEING = 30
 """Photos are matched again under a hypothesis with so many agreeing matches (different places have up to 16),"""
 LEAST_GAIN = 2.0
@@ -44,6 +45,8 @@ HypothesisPair = tuple[Hypothesis, Hypothesis]
 UNCHANGED = (IDENTITY, IDENTITY)
 ROTATIONS: tuple[HypothesisPair, ...] = tuple((IDENTITY, Hypothesis(rotation_deg)) for rotation_deg in ROTATIONS_DEG)
 """Compared first,"""
+TILTS: tuple[HypothesisPair, ...] = tuple((IDENTITY, Hypothesis(rotation_deg)) for rotation_deg in TILTS_DEG)
+"""then these,"""
 SCALES: tuple[HypothesisPair, ...] = tuple(
     hypotheses
     for downscale in DOWNSCALES
@@ -70,10 +73,21 @@ class Sketch:
         return self.image.grey.nbytes + sum(cells.nbytes for cells in self.cells.values())
 
     def encode(self, hypothesis: Hypothesis, matcher: CellMatcher) -> Tensor:
-        """(H, W, C) float32: the cells under a hypothesis, encoded once."""
+        """(H, W, C) float32: the cells under a hypothesis, encoded once; zero beside a photo that is tilted."""
         if hypothesis not in self.cells:
-            self.cells[hypothesis] = matcher.encode(apply_hypothesis(self.image, hypothesis))
+            image = apply_hypothesis(self.image, hypothesis)
+            cells = matcher.encode(image)
+            inside = torch.tensor(find_cells_inside(image, *cells.shape[:2]), device=cells.device)
+            self.cells[hypothesis] = cells * inside[..., None]
         return self.cells[hypothesis]
+
+
+def find_cells_inside(image: PreparedImage, rows: int, columns: int) -> np.ndarray:
+    """(rows, columns) bool: which cells of a prepared image show the photo."""
+    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1) + 0.5
+    xy = grid.reshape(-1, 2) * np.array(image.scaled_wh) / (columns, rows)
+    stored = xy @ image.stored_from_scaled[:2, :2].T + image.stored_from_scaled[:2, 2]
+    return is_inside(stored, image.ref.size_wh).reshape(rows, columns)
 
 
 def choose_hypotheses(matcher: CellMatcher, sketch0: Sketch, sketch1: Sketch) -> HypothesisPair | None:
@@ -91,8 +105,9 @@ def choose_hypotheses(matcher: CellMatcher, sketch0: Sketch, sketch1: Sketch) ->
         return count_agreeing(place_cells(index0, cells0.shape[1]), place_cells(index1, cells1.shape[1]))
 
     counts = {hypotheses: count(*hypotheses) for hypotheses in ROTATIONS}
-    if max(counts.values()) < ENOUGH_AGREEING:
-        counts |= {hypotheses: count(*hypotheses) for hypotheses in SCALES}
+    for others in (TILTS, SCALES):
+        if max(counts.values()) < ENOUGH_AGREEING:
+            counts |= {hypotheses: count(*hypotheses) for hypotheses in others}
     best = max(counts, key=counts.__getitem__)
     needed = LEAST_AGREEING if best == UNCHANGED else max(LEAST_AGREEING, LEAST_GAIN * counts[UNCHANGED])
     if counts[best] < needed:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hm_sfm.config import ImageConfig, MatchingConfig, NetworkConfig
+from hm_sfm.config import GOOD_SCORE, ImageConfig, MatchingConfig, NetworkConfig
 from hm_sfm.matching.cells import CoarseCells
 from hm_sfm.matching.encoder import Encoder
 from hm_sfm.matching.epipolar import agree_with, fit_fundamental
@@ -33,10 +33,8 @@ from hm_sfm.photos.hypotheses import apply_hypothesis
 from hm_sfm.photos.images import PreparedImage, prepare_array, prepare_image, read_ref
 from hm_sfm.types import PatchMatches
 
-GROWING_SCORE = 0.5
-"""Matches at least as good as this spread to their neighbours."""
 GROWING_ROUNDS = 12
-"""How many cells far they spread."""
+"""How many cells far good matches spread."""
 
 
 class HomoMatcher:
@@ -115,11 +113,11 @@ class HomoMatcher:
         stored = locate_patches(
             patches, offset0, features0.stored_from_scaled, features1.stored_from_scaled, grid, head.half
         )
-        inside = [
-            is_inside(xy, features.scaled_wh, features.stored_from_scaled)
-            for xy, features in ((stored.xy0, features0), (stored.xy1, features1))
-        ]
-        keep = (stored.regular & inside[0] & inside[1]).nonzero()[0]
+        inside0, inside1 = (
+            is_inside(stored.xy0, features0.image.size_wh),
+            is_inside(stored.xy1, features1.image.size_wh),
+        )
+        keep = (stored.regular & inside0 & inside1).nonzero()[0]
         keep = keep[np.argsort(-stored.score[keep], kind="stable")][: self.config.max_matches]
         return PatchMatches(
             xy0=stored.xy0[keep],
@@ -152,14 +150,14 @@ class HomoMatcher:
         good matches have a two-view geometry, only matches that agree with it grow, and only into such.
         """
         head = self.net.head
-        few = torch.count_nonzero(patches.score >= GROWING_SCORE) < self.config.grow_below
+        few = torch.count_nonzero(patches.score >= GOOD_SCORE) < self.config.grow_below
         wanted = (points.grow == "always" and self.config.grow_below > 0) or (points.grow == "if few" and few)
         if not wanted or not isinstance(head, HomographyHead) or not len(points):
             return patches, offset0
         grid = self._lay_grid(features0.scaled_wh, is_chessboard=points.grow == "always")
         fundamental = None
         if points.place is not None:
-            good = (is_regular(patches.homography, head.half) & (patches.score >= GROWING_SCORE)).cpu().numpy()
+            good = (is_regular(patches.homography, head.half) & (patches.score >= GOOD_SCORE)).cpu().numpy()
             xy0, xy1 = locate_matches(patches, offset0, self.net.backbone.fine_grid)
             fundamental = fit_fundamental(xy0[good], xy1[good], points.place[good])
 
@@ -175,7 +173,7 @@ class HomoMatcher:
             return doubt(estimate_patches(head, features0.fine, features1.fine, cell0, cell1, start, place))
 
         seeds = doubt(patches, offset0)
-        grown = grow_matches(seeds, grid, refine, features1.fine.size_wh, GROWING_SCORE, GROWING_ROUNDS)
+        grown = grow_matches(seeds, grid, refine, features1.fine.size_wh, GOOD_SCORE, GROWING_ROUNDS)
         beside = ~grid.holds(patches.cell0)
         patches = PatchEstimates.concatenate([patches.select(beside), grown])
         kept = offset0[beside.cpu().numpy()]

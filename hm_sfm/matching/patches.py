@@ -107,8 +107,6 @@ def patch_to_px(cell: np.ndarray, grid: Grid) -> np.ndarray:
     return matrix
 
 
-def is_inside(xy: np.ndarray, scaled_wh: tuple[int, int], stored_from_scaled: np.ndarray) -> np.ndarray:
+def is_inside(xy: np.ndarray, size_wh: tuple[int, int]) -> np.ndarray:
     """(M,) bool: which points (M, 2), px of the stored image, lie in it."""
-    width, height = scaled_wh
-    corners = stored_from_scaled[:2] @ np.array([[0, width], [0, height], [1, 1]])
-    return np.all((xy >= corners.min(axis=1)) & (xy < corners.max(axis=1)), axis=1)
+    return np.all((xy >= 0) & (xy < size_wh), axis=1)

@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 
 from hm_sfm.errors import ConfigError, InputError, MissingPackageError
-from hm_sfm.geometry.frames import flip_matrix, rotation_matrix
+from hm_sfm.geometry.frames import flip_matrix, homography_to_pixel_index, rotation_matrix
 from hm_sfm.photos.bitmaps import (
     INSTALL_HEIC,
     JPEG_MAGIC,
@@ -214,7 +214,21 @@ def read_rgb(image: PreparedImage) -> np.ndarray:
     is_usable = bitmap is not None and not lacks_range(image.ref.path)
     if bitmap is None or not is_usable or (bitmap.width, bitmap.height) != tuple(image.ref.size_wh):
         return np.repeat(np.rint(image.grey * 255).astype(np.uint8)[:, :, None], 3, axis=2)
-    return cv2.resize(show_upright(bitmap.to_array(), image.ref), image.scaled_wh, interpolation=cv2.INTER_AREA)
+    rgb = bitmap.to_array()
+    bitmap_from_scaled = image.stored_from_scaled
+    if image.ref.flipped:
+        bitmap_from_scaled = flip_matrix(bitmap.width) @ bitmap_from_scaled
+    if np.count_nonzero(abs(bitmap_from_scaled[:2, :2]) > 1e-9) == 2:  # not tilted
+        return cv2.resize(show_upright(rgb, image.ref), image.scaled_wh, interpolation=cv2.INTER_AREA)
+    scale = np.sqrt(abs(np.linalg.det(bitmap_from_scaled[:2, :2])))
+    reduced_wh = tuple(max(1, round(size / scale)) for size in image.ref.size_wh)
+    reduced = cv2.resize(rgb, reduced_wh, interpolation=cv2.INTER_AREA)
+    bitmap_from_reduced = np.diag([bitmap.width / reduced_wh[0], bitmap.height / reduced_wh[1], 1.0])
+    scaled_from_reduced = np.linalg.inv(bitmap_from_scaled) @ bitmap_from_reduced
+    border = reduced.mean(axis=(0, 1)).tolist()
+    return cv2.warpAffine(
+        reduced, homography_to_pixel_index(scaled_from_reduced)[:2], image.scaled_wh, borderValue=border
+    )
 
 
 def _prepare(ref: ImageRef, stored: np.ndarray, long_edge_px: int) -> PreparedImage:

@@ -1,6 +1,7 @@
 """Pairs of photos that are turned against each other, or of very different scale."""
 
 import dataclasses
+import math
 from pathlib import Path
 
 import cv2
@@ -9,18 +10,20 @@ import numpy as np
 import pytest
 
 from hm_sfm.config import ImageConfig, MatchingConfig
-from hm_sfm.geometry.frames import pixel_index_from_px, rotation_matrix
+from hm_sfm.geometry.frames import homography_to_pixel_index, pixel_index_from_px, rotation_matrix
 from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.matching.feature_cache import cache_features, match_pair
 from hm_sfm.matching.hypotheses import (
     FEW_MATCHES,
     ROTATIONS,
     SCALES,
+    TILTS,
     UNCHANGED,
     Sketch,
     choose_hypotheses,
     count_agreeing,
     count_good,
+    find_cells_inside,
     place_cells,
     relate_scales,
 )
@@ -111,6 +114,26 @@ def test_turned_photos_match_as_upright_ones_do(matcher, upright, photo, other, 
     assert_right(matcher.match(photo, turned), truth, 350)
 
 
+def tilt(image: np.ndarray, rotation_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """What is left of an image in its middle, (180, 180) uint8, as it is rotated clockwise; px of it -> px of that."""
+    height, width = image.shape
+    angle = np.deg2rad(rotation_deg)
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    tilted_from_image = np.eye(3)
+    tilted_from_image[:2, :2] = rotation
+    tilted_from_image[:2, 2] = 90 - rotation @ (width / 2, height / 2)
+    size_wh = (180, 180)
+    return cv2.warpAffine(image, homography_to_pixel_index(tilted_from_image)[:2], size_wh), tilted_from_image
+
+
+@pytest.mark.parametrize("rotation_deg", [135, 225])
+def test_a_photo_between_the_quarter_turns_matches_as_an_upright_one_does(matcher, scene, photo, rotation_deg):
+    half = cv2.resize(scene, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    tilted, tilted_from_half = tilt(half, rotation_deg)
+    truth = tilted_from_half @ [[1, 0, 20], [0, 1, 40], [0, 0, 1.0]]  # `photo` begins there
+    assert_right(matcher.match(photo, tilted), truth, 400)
+
+
 def test_a_photo_three_times_closer(matcher, upright, whole, middle):
     as_they_are, good = (
         matches.select(matches.score >= 0.5) for matches in (upright.match(whole, middle), matcher.match(whole, middle))
@@ -158,7 +181,8 @@ def test_neither_order_nor_memory_matter(matcher, folder, one_thread):
     images = [read_ref(path) for path in sorted(folder.glob("*.png"))]
     pairs = [ImagePair(f"{a}.png", f"{b}.png") for a, b in ("ab", "bc", "ac")]
     found = []
-    for order, limit_mb in ((pairs, 1500), (pairs[::-1], 3)):
+    just_enough_mb = math.ceil(2e-6 * max(matcher.encode(prepare_image(image, 1024)).size_bytes for image in images))
+    for order, limit_mb in ((pairs, 1500), (pairs[::-1], just_enough_mb)):
         limited = HomoMatcher.from_network(matcher.net, MatchingConfig(feature_cache_mb=limit_mb), ImageConfig())
         cache = cache_features(images, limited)
         found.append({pair: match_pair(cache, pair) for pair in order})
@@ -207,6 +231,28 @@ def test_points_of_a_variant_are_those_of_the_stored_photo(rotation_deg, downsca
     np.testing.assert_allclose(again.stored_from_scaled, np.diag([downscale, downscale, 1]))
 
 
+@pytest.mark.parametrize(("rotation_deg", "mirrored"), [(45, False), (200, False), (70, True)])
+def test_a_tilted_photo_is_whole_and_its_points_are_those_of_the_stored_one(tmp_path, rotation_deg, mirrored):
+    """Bright spots on grey: where they are in the tilted photo, and in its colours as other packages read them."""
+    spots = np.array([[6, 7], [60, 5], [71, 41], [9, 38], [33, 20]])
+    stored = np.full((48, 80), 90, np.uint8)
+    stored[spots[:, 1], spots[:, 0]] = 255
+    cv2.imwrite(str(tmp_path / "a.png"), stored)
+    ref = dataclasses.replace(read_ref(tmp_path / "a.png"), mirrored=mirrored, flipped=mirrored)
+    shown = apply_hypothesis(prepare_image(ref, 1024), Hypothesis(rotation_deg))
+    xy = spots + 0.5
+    if mirrored:
+        xy[:, 0] = 80 - xy[:, 0]
+    scaled_from_stored = np.linalg.inv(shown.stored_from_scaled)
+    x, y = np.floor(xy @ scaled_from_stored[:2, :2].T + scaled_from_stored[:2, 2]).astype(int).T
+    for grey in (shown.grey, read_rgb(shown)[:, :, 0] / 255):
+        assert grey.shape == shown.scaled_wh[::-1]
+        around = [grey[row - 1 : row + 2, column - 1 : column + 2].max() for row, column in zip(y, x)]
+        assert min(around) > 0.5 and np.median(grey) == pytest.approx(90 / 255, abs=0.02)
+    inside = find_cells_inside(shown, *shown.grey.shape)
+    assert inside.sum() == pytest.approx(48 * 80, rel=0.03) and inside[y, x].all() and not inside[0, 0]
+
+
 def test_the_photo_as_it_is_is_not_touched(photo):
     image = prepare_array(photo, 1024)
     assert apply_hypothesis(image, IDENTITY) is image
@@ -220,8 +266,8 @@ def test_providers_that_read_the_photo_read_it_turned(tmp_path):
 
 
 def test_each_way_is_compared_once():
-    ways = ROTATIONS + SCALES
-    assert ways[0] == UNCHANGED and len(ways) == len(set(ways)) == 4 + 4 * 4
+    ways = ROTATIONS + TILTS + SCALES
+    assert ways[0] == UNCHANGED and len(ways) == len(set(ways)) == 4 + 4 + 4 * 4
     assert all(
         hypothesis0.rotation_deg == 0 and 1 in (hypothesis0.downscale, hypothesis1.downscale)
         for hypothesis0, hypothesis1 in ways

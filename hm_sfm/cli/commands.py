@@ -8,7 +8,7 @@ import json
 import math
 from pathlib import Path
 
-from hm_sfm.config import Config, load_config
+from hm_sfm.config import Config, MaskConfig, load_config
 from hm_sfm.errors import InputError, NoModelError
 from hm_sfm.io.atomic import replace_file
 
@@ -100,7 +100,8 @@ def run_refine(options: argparse.Namespace) -> int:
 def run_convert(options: argparse.Namespace) -> int:
     from hm_sfm.export.conversion import convert_run
 
-    convert_run(options.out, options.to, options.target, options.images)
+    masks = MaskConfig(options.masks or "", options.camera_mask or "") if options.masks or options.camera_mask else None
+    convert_run(options.out, options.to, options.target, options.images, masks)
     print(f"{options.to}: {options.target}")
     return 0
 

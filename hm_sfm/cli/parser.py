@@ -193,6 +193,8 @@ def add_convert_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("target", metavar="DEST", type=Path, help="a new folder; for ply, a new file")
     text = "folder of the photos, if they were moved after the run"
     command.add_argument("--images", metavar="DIR", type=Path, help=text)
+    command.add_argument("--masks", metavar="DIR", help="folder of the masks, if they were moved after the run")
+    command.add_argument("--camera-mask", metavar="FILE", help="the mask of all photos, if it was moved after the run")
 
 
 def add_frames_options(command: argparse.ArgumentParser) -> None:

@@ -3,8 +3,8 @@
 | format | what is written |
 |---|---|
 | hloc | a folder: features.h5, matches.h5, pairs.txt, see hm_sfm.formats.hloc |
-| nerfstudio | a folder: undistorted images/, transforms.json, points3D.ply |
-| 3dgs | a folder: undistorted images/, sparse/0 with PINHOLE cameras |
+| nerfstudio | a folder: undistorted images/, masks/ where there are any, transforms.json, points3D.ply |
+| 3dgs | a folder: undistorted images/, transparent where they are masked, sparse/0 with PINHOLE cameras |
 | ply | a file: the points and their colours |
 | txt | a folder: the model as COLMAP's text files |
 """
@@ -12,7 +12,6 @@
 import json
 import logging
 import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,14 +20,16 @@ import pycolmap
 
 from hm_sfm.colmap.database import open_database
 from hm_sfm.colmap.models import read_model
+from hm_sfm.config import MaskConfig
 from hm_sfm.errors import InputError
+from hm_sfm.export.point_clouds import move_to_origin, write_ply
+from hm_sfm.export.undistorted_photos import undistort_photos
 from hm_sfm.formats.hloc import write_features, write_matches
 from hm_sfm.formats.pairs_files import read_pairs, write_pairs
-from hm_sfm.io.atomic import make_folder, replace_file
-from hm_sfm.io.colmap_log import quiet_colmap
+from hm_sfm.io.atomic import make_folder, replace_file, write_json
 from hm_sfm.io.markers import MADE_MARKER
-from hm_sfm.photos.bitmaps import is_read_by_colmap, open_to_colmap
 from hm_sfm.photos.images import read_run_ref
+from hm_sfm.photos.masks import read_masks
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 logger = logging.getLogger(__name__)
@@ -37,14 +38,16 @@ GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Cameras of OpenGL look along -z with y up, those of COLMAP along z with y down."""
 
 
-def convert_run(out: Path, to: str, target: Path, image_folder: Path | None = None) -> None:
+def convert_run(
+    out: Path, to: str, target: Path, image_folder: Path | None = None, masks: MaskConfig | None = None
+) -> None:
     """Write the largest model of the run in `out`, or its database for hloc, in the format `to` to `target`.
 
     target: a new file for ply, a new or empty folder for all others; it appears whole or not at all.
-    image_folder: the photos, if they are no longer where they were in the run.
+    image_folder, masks: the photos and their masks, if they are no longer where they were in the run.
 
-    Raises InputError where the run has no model or database, where photos are missing or cannot be undistorted, where
-    hloc cannot tell image names apart, and where the target is there already.
+    Raises InputError where the run has no model or database, where photos or masks are missing or photos cannot be
+    undistorted, where hloc cannot tell image names apart, and where the target is there already.
     """
     out, target = Path(out), Path(target)
     if to == "ply":
@@ -56,9 +59,9 @@ def convert_run(out: Path, to: str, target: Path, image_folder: Path | None = No
         elif to == "hloc":
             convert_to_hloc(out, folder)
         elif to == "nerfstudio":
-            convert_to_nerfstudio(out, folder, image_folder)
+            convert_to_nerfstudio(out, folder, image_folder, masks)
         else:
-            convert_to_3dgs(out, folder, image_folder)
+            convert_to_3dgs(out, folder, image_folder, masks)
 
 
 def find_photos(out: Path, image_folder: Path | None) -> Path:
@@ -73,14 +76,26 @@ def find_photos(out: Path, image_folder: Path | None) -> Path:
     return Path(image_folder)
 
 
+def find_masks(out: Path) -> MaskConfig:
+    """The masks that a run was made with. Raises InputError where they are no longer there."""
+    try:
+        made_with = MaskConfig(**json.loads((out / "summary.json").read_text())["masks"])
+    except (OSError, ValueError, KeyError, TypeError):  # runs of earlier versions do not say
+        return MaskConfig()
+    for path, option in ((made_with.folder, "--masks"), (made_with.camera, "--camera-mask")):
+        if path and not Path(path).exists():
+            raise InputError(f"the run was made with the masks {path}, which do not exist: name them with {option}")
+    return made_with
+
+
 def convert_to_ply(out: Path, target: Path) -> None:
-    """The points of the model with their colours, as a binary PLY file."""
+    """The points of the model with their colours, as a binary PLY file of doubles."""
     model = _read_result(out)
     if target.exists():
         raise InputError(f"{target} is there already: name a new file")
     target.parent.mkdir(parents=True, exist_ok=True)
     with replace_file(target) as temporary:
-        model.export_PLY(temporary)
+        write_ply(temporary, model)
 
 
 def convert_to_txt(out: Path, folder: Path) -> None:
@@ -116,12 +131,13 @@ def convert_to_hloc(out: Path, folder: Path) -> None:
     write_pairs(folder / "pairs.txt", pairs)
 
 
-def convert_to_3dgs(out: Path, folder: Path, image_folder: Path | None) -> None:
+def convert_to_3dgs(out: Path, folder: Path, image_folder: Path | None, masks: MaskConfig | None) -> None:
     """Undistorted images and their model with PINHOLE cameras, laid out for Gaussian splatting.
 
-    Its readers take the images from one folder by their last names, so that subfolders become part of the names.
+    Its readers take the images from one folder by their last names, so that subfolders become part of the names. What
+    is transparent is left out of training: that is what masks become.
     """
-    model = undistort_photos(out, folder, image_folder)
+    model = undistort_run(out, folder, image_folder, masks, masks_as_alpha=True)
     names = flatten_names([image.name for image in model.images.values()])
     for image in model.images.values():
         if names[image.name] != image.name:
@@ -134,16 +150,20 @@ def convert_to_3dgs(out: Path, folder: Path, image_folder: Path | None) -> None:
     model.write_binary(folder / "sparse" / "0")
 
 
-def convert_to_nerfstudio(out: Path, folder: Path, image_folder: Path | None) -> None:
-    """Undistorted images, transforms.json and the points, in the model's own frame of coordinates."""
-    model = undistort_photos(out, folder, image_folder)
-    model.export_PLY(folder / "points3D.ply")
-    transforms = {"camera_model": "PINHOLE", "ply_file_path": "points3D.ply", **describe_frames(model)}
+def convert_to_nerfstudio(out: Path, folder: Path, image_folder: Path | None, masks: MaskConfig | None) -> None:
+    """Undistorted images, masks, transforms.json and the points."""
+    model = undistort_run(out, folder, image_folder, masks, masks_as_alpha=False)
+    write_ply(folder / "points3D.ply", model)
+    transforms = {
+        "camera_model": "PINHOLE",
+        "ply_file_path": "points3D.ply",
+        **describe_frames(model, has_masks=(folder / "masks").is_dir()),
+    }
     (folder / "transforms.json").write_text(json.dumps(transforms, indent=2) + "\n")
 
 
-def describe_frames(model: pycolmap.Reconstruction) -> dict[str, object]:
-    """Cameras and poses of a model of PINHOLE cameras as transforms.json has them, files in images/.
+def describe_frames(model: pycolmap.Reconstruction, has_masks: bool = False) -> dict[str, object]:
+    """Cameras and poses of a model of PINHOLE cameras as transforms.json has them, files in images/ and masks/.
 
     Intrinsics stand at the top where all images share them, else in each frame; transform_matrix is world_from_cam of
     a camera as in OpenGL.
@@ -156,18 +176,24 @@ def describe_frames(model: pycolmap.Reconstruction) -> dict[str, object]:
         fx, fy, cx, cy = map(float, camera.params)
         intrinsics = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": camera.width, "h": camera.height}
         pose = {"file_path": f"images/{image.name}", "transform_matrix": (world_from_cam @ GL_FROM_CV).tolist()}
+        if has_masks:
+            pose["mask_path"] = f"masks/{image.name}.png"
         frames.append((intrinsics, pose))
     if all(intrinsics == frames[0][0] for intrinsics, _ in frames):
         return {**frames[0][0], "frames": [pose for _, pose in frames]}
     return {"frames": [{**intrinsics, **pose} for intrinsics, pose in frames]}
 
 
-def undistort_photos(out: Path, folder: Path, image_folder: Path | None) -> pycolmap.Reconstruction:
-    """Write the undistorted photos of the model to folder/images, and return the model that belongs to them.
+def undistort_run(
+    out: Path, folder: Path, image_folder: Path | None, masks: MaskConfig | None, masks_as_alpha: bool
+) -> pycolmap.Reconstruction:
+    """Write the undistorted photos of the model to `folder`, see undistort_photos; returns the model of them.
 
-    Its cameras are PINHOLE. Raises InputError where a photo is missing or cannot be undistorted.
+    Where it lies far from the origin it is moved there, and folder/offset.json says how far. Raises InputError where a
+    photo is missing or cannot be undistorted, or a mask is unusable.
     """
-    names = [image.name for image in _read_result(out).images.values()]
+    model = _read_result(out)
+    names = [image.name for image in model.images.values()]
     photos = find_photos(out, image_folder)
     missing = [name for name in names if not (photos / name).is_file()]
     if missing:
@@ -176,29 +202,16 @@ def undistort_photos(out: Path, folder: Path, image_folder: Path | None) -> pyco
             "folder of photos with --images"
         )
     images = [read_run_ref(photos / name, name) for name in names]
-    foreign = [name for name in names if not is_read_by_colmap(photos / name)]
-    if foreign:
-        raise InputError(
-            f"COLMAP cannot undistort photos of the kind of {photos / foreign[0]}: convert the {len(foreign)} of them "
-            "to JPEG and reconstruct again"
-        )
-    # What COLMAP logs are the photos that it cannot read, which are told below.
-    with tempfile.TemporaryDirectory(dir=folder) as temporary, quiet_colmap(pycolmap.logging.FATAL):
-        with open_to_colmap(images, photos) as readable_photos:
-            pycolmap.undistort_images(temporary, out / "sparse" / "0", readable_photos)
-        undistorted = Path(temporary) / "images"
-        written = {path.relative_to(undistorted).as_posix() for path in undistorted.rglob("*")}
-        failed = [name for name in names if name not in written]
-        if failed:
-            raise InputError(f"cannot undistort {len(failed)} of {len(names)} photos, for example {photos / failed[0]}")
-        os.replace(undistorted, folder / "images")
-        model = read_model(Path(temporary) / "sparse")
+    undistort_photos(model, images, folder, read_masks(images, masks or find_masks(out)), masks_as_alpha)
     (folder / MADE_MARKER).touch()
-    for camera in model.cameras.values():
-        if camera.model == pycolmap.CameraModelId.SIMPLE_PINHOLE:  # undistorted already, so it was left as it is
-            focal, cx, cy = camera.params
-            camera.model = pycolmap.CameraModelId.PINHOLE
-            camera.params = [focal, focal, cx, cy]
+    offset = move_to_origin(model)
+    if offset:
+        write_json(folder / "offset.json", {"offset": offset})
+        logger.warning(
+            "the coordinates are too large for single precision: they are written less the offset (%s), which "
+            "offset.json keeps",
+            ", ".join(f"{value:.12g}" for value in offset),
+        )
     return model
 
 

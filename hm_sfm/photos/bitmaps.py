@@ -180,14 +180,14 @@ def open_to_colmap(images: Sequence[ImageRef], image_folder: Path) -> Iterator[P
             target.parent.mkdir(parents=True, exist_ok=True)
             if image.name not in copied:
                 target.symlink_to(image.path.absolute())
-            elif (pixels := _read_frame(image)) is not None:
+            elif (pixels := read_frame(image)) is not None:
                 jpeg = Path(temporary) / "written.jpg"
                 pycolmap.Bitmap.from_array(pixels).write(jpeg)
                 os.replace(jpeg, target)
         yield Path(temporary)
 
 
-def _read_frame(image: ImageRef) -> np.ndarray | None:
+def read_frame(image: ImageRef) -> np.ndarray | None:
     """(H, W, 3) uint8 RGB in the frame of the image's coordinates; None where the file cannot be decoded."""
     if lacks_range(image.path):
         grey = read_deep_tiff(image.path.read_bytes(), image)
@@ -196,3 +196,15 @@ def _read_frame(image: ImageRef) -> np.ndarray | None:
         bitmap = read_bitmap(image.path, as_rgb=True)
         pixels = None if bitmap is None else bitmap.to_array()
     return np.ascontiguousarray(pixels[:, ::-1]) if image.flipped and pixels is not None else pixels
+
+
+def read_alpha(image: ImageRef) -> np.ndarray | None:
+    """(H, W) uint8 in the frame of the image's coordinates, 0 is transparent; None where all of the photo is opaque."""
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(image.path) as file:
+            alpha = np.array(file.convert("RGBA").getchannel("A")) if file.has_transparency_data else None
+    except (ValueError, OSError, SyntaxError, EOFError, Image.DecompressionBombError):
+        return None  # what cannot be read has no alpha; that it cannot be read is said elsewhere
+    if alpha is None or alpha.shape != (image.size_wh[1], image.size_wh[0]) or (alpha == 255).all():
+        return None
+    return np.ascontiguousarray(alpha[:, ::-1]) if image.flipped else alpha

@@ -46,6 +46,12 @@ class Masks:
         pair = matches.pair
         return matches.select(~(self.hides(pair.name0, matches.xy0) | self.hides(pair.name1, matches.xy1)))
 
+    def unpack(self, image: ImageRef) -> np.ndarray | None:
+        """(H, W) bool: which pixels of an image may be used, in the frame of its coordinates; None without a mask."""
+        if image.name not in self.packed:
+            return None
+        return np.unpackbits(self.packed[image.name], axis=1, count=image.size_wh[0]).astype(bool)
+
     def digest(self) -> str:
         """16 hex digits that change when any mask does."""
         digest = hashlib.sha256()

@@ -1,8 +1,10 @@
 """OUT/summary.json: what became of a run, in numbers."""
 
+import dataclasses
 import json
 from collections.abc import Sequence
 from importlib.metadata import version
+from pathlib import Path
 
 from hm_sfm.config import fingerprint
 from hm_sfm.io.atomic import replace_file
@@ -14,8 +16,10 @@ from hm_sfm.types import MappingResult
 def write_summary(run: Run, result: MappingResult, diagnoses: Sequence[Diagnosis]) -> None:
     """OUT/summary.json, atomically."""
     seconds = run.timings.seconds | {"total": run.timings.total}
+    masks = dataclasses.asdict(run.config.masks)
     metrics = {
         "image_folder": str(run.collection.folder.resolve()),
+        "masks": {kind: str(Path(path).resolve()) if path else "" for kind, path in masks.items()},
         "num_images": result.num_images,
         "skipped_images": run.collection.skipped,
         "registered": result.registered,

@@ -9,10 +9,12 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image, ImageOps
 from plyfile import PlyData
 
 from hm_sfm.colmap.cameras import Cameras
 from hm_sfm.colmap.database import write_database
+from hm_sfm.config import MaskConfig
 from hm_sfm.errors import InputError
 from hm_sfm.export.conversion import convert_run, flatten_names
 from hm_sfm.formats.pairs_files import write_pairs
@@ -23,6 +25,8 @@ from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 WIDTH, HEIGHT = 320, 240
 NAMES = ("left/1.png", "left_1.png", "right/1.png", "right/2.png")
+ORIENTATION = 0x0112
+"""EXIF's tag."""
 DISC_PX = (250.0, 60.0)
 """Where each photo shows a white disc."""
 
@@ -112,14 +116,241 @@ def read_model(folder: Path) -> list[pycolmap.Image]:
     return list(read_model.model.images.values())
 
 
-@pytest.mark.parametrize(("model", "params"), [("SIMPLE_PINHOLE", [300, 160, 120]), ("PINHOLE", [300, 310, 160, 120])])
-def test_3dgs_of_cameras_without_distortion(tmp_path, model, params):
-    out = make_run(tmp_path, model, params)
+DISTORTIONS = {
+    "SIMPLE_PINHOLE": [300, 158, 121],
+    "PINHOLE": [300, 310, 158, 121],
+    "SIMPLE_RADIAL": [300, 158, 121, 0.08],
+    "RADIAL": [300, 158, 121, 0.08, -0.02],
+    "OPENCV": [300, 310, 158, 121, 0.08, -0.02, 0.01, -0.01],
+    "FULL_OPENCV": [300, 310, 158, 121, 0.08, -0.02, 0.01, -0.01, 0.01, 0, 0.01, 0],
+    "FOV": [300, 310, 158, 121, 0.6],
+    "SIMPLE_DIVISION": [300, 158, 121, -0.1],
+    "DIVISION": [300, 310, 158, 121, -0.1],
+    "EUCM": [300, 310, 158, 121, 0.5, 1.1],
+    "SIMPLE_FISHEYE": [200, 158, 121],
+    "FISHEYE": [200, 210, 158, 121],
+    "SIMPLE_RADIAL_FISHEYE": [200, 158, 121, 0.05],
+    "RADIAL_FISHEYE": [200, 158, 121, 0.05, -0.01],
+    "OPENCV_FISHEYE": [200, 210, 158, 121, 0.05, -0.01, 0, 0],
+    "THIN_PRISM_FISHEYE": [200, 210, 158, 121, 0.05, -0.01, 0.01, 0, 0, 0, 0, 0],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [200, 210, 158, 121, 0.05, -0.01, 0, 0, 0, 0, 0.01, 0, 0, 0, 0, 0],
+}
+"""Each model of perspective cameras, and parameters with distortion."""
+
+
+def test_all_models_of_colmap_are_tested():
+    models = set(pycolmap.CameraModelId.__members__) - {"INVALID"}
+    cameras = [pycolmap.Camera.create_from_model_name(1, model, 300, WIDTH, HEIGHT) for model in models]
+    assert {camera.model_name for camera in cameras if camera.is_perspective()} == set(DISTORTIONS)
+
+
+@pytest.mark.parametrize("distorted", [True, False], ids=["distorted", "not distorted"])
+@pytest.mark.parametrize("model_name", DISTORTIONS)
+def test_each_model_of_cameras_becomes_pinhole_with_photos_that_fit(tmp_path, model_name, distorted):
+    camera = pycolmap.Camera.create_from_model_name(1, model_name, 300, WIDTH, HEIGHT)
+    params = np.array(DISTORTIONS[model_name], float)
+    if not distorted:
+        params[camera.extra_params_idxs()] = camera.params[camera.extra_params_idxs()]
+    camera.params = params
+    out = make_run(tmp_path, model_name, params.tolist(), ("a.png", "b/c.png"))
+    convert_run(out, "nerfstudio", tmp_path / "ns")
     convert_run(out, "3dgs", tmp_path / "3dgs")
-    (camera,) = pycolmap.Reconstruction(tmp_path / "3dgs" / "sparse" / "0").cameras.values()
-    assert camera.model == pycolmap.CameraModelId.PINHOLE
-    assert camera.params.tolist() == [300, params[-3] if model == "PINHOLE" else 300, 160, 120]
-    np.testing.assert_allclose(find_disc(tmp_path / "3dgs" / "images" / "right_1.png"), DISC_PX, atol=0.1)
+
+    model = pycolmap.Reconstruction(tmp_path / "3dgs" / "sparse" / "0")
+    (pinhole,) = model.cameras.values()
+    assert pinhole.model == pycolmap.CameraModelId.PINHOLE
+    transforms = json.loads((tmp_path / "ns" / "transforms.json").read_text())
+    intrinsics = [transforms[key] for key in ("fl_x", "fl_y", "cx", "cy")]
+    assert intrinsics == pinhole.params.tolist() and (transforms["w"], transforms["h"]) == (
+        pinhole.width,
+        pinhole.height,
+    )
+    expected = pinhole.img_from_cam(np.append(camera.cam_from_img(np.array(DISC_PX)), 1))
+    for path in (tmp_path / "ns" / "images" / "b" / "c.png", tmp_path / "3dgs" / "images" / "b_c.png"):
+        assert cv2.imread(str(path)).shape == (pinhole.height, pinhole.width, 3)
+        np.testing.assert_allclose(find_disc(path), expected, atol=0.3)
+    if not distorted and camera.is_perspective_pinhole() and model_name not in ("FOV", "EUCM"):
+        assert intrinsics == [camera.focal_length_x, camera.focal_length_y, 158, 121]
+        assert (tmp_path / "ns/images/a.png").read_bytes() == (tmp_path / "photos/a.png").read_bytes()
+    for image in model.images.values():
+        for point2D in image.get_observation_points2D():
+            projected = image.project_point(model.points3D[point2D.point3D_id].xyz)
+            np.testing.assert_allclose(projected, point2D.xy, atol=0.1)
+
+
+def test_what_no_pinhole_camera_can_show_is_left_out(tmp_path):
+    """Keypoints where the camera model has no ray."""
+    out = make_run(tmp_path, "EUCM", [150, 150, 160, 120, 0.9, 2.0], ("a.png", "b.png"))
+    model = pycolmap.Reconstruction(out / "sparse" / "0")
+    image = next(iter(model.images.values()))
+    index = next(i for i in range(len(image.points2D)) if image.points2D[i].has_point3D())
+    image.points2D[index].xy = (2, 120)
+    observations = model.compute_num_observations()
+    model.write_binary(out / "sparse" / "0")
+    convert_run(out, "3dgs", tmp_path / "3dgs")
+    converted = pycolmap.Reconstruction(tmp_path / "3dgs" / "sparse" / "0")
+    assert 0 < converted.compute_num_observations() < observations
+    assert all(np.isfinite(p.xy).all() for i in converted.images.values() for p in i.get_observation_points2D())
+
+
+def test_photos_of_another_size_than_their_camera(out, tmp_path):
+    cv2.imwrite(str(tmp_path / "photos" / NAMES[2]), np.zeros((HEIGHT, WIDTH // 2, 3), np.uint8))
+    with pytest.raises(InputError, match=f"{NAMES[2]} is 160 x 240 px but its camera in the model is of 320 x 240 px"):
+        convert_run(out, "3dgs", tmp_path / "3dgs")
+
+
+# Orientation, transparency, masks
+
+
+@pytest.mark.parametrize("params", [[300.0, 160.0, 120.0, 0.08], [300.0, 160.0, 120.0, 0.0]], ids=["distorted", "not"])
+@pytest.mark.parametrize("orientation", [1, 2, 3, 6, 8])
+def test_nobody_turns_undistorted_copies(tmp_path, orientation, params):
+    out = make_run(tmp_path, "SIMPLE_RADIAL", params, ("a.jpg", "b.jpg"))
+    for name in ("a.jpg", "b.jpg"):
+        pixels = cv2.cvtColor(cv2.imread(str(tmp_path / "photos" / name)), cv2.COLOR_BGR2RGB)
+        write_jpeg(tmp_path / "photos" / name, pixels, 28, orientation=orientation)
+    convert_run(out, "nerfstudio", tmp_path / "ns")
+    transforms = json.loads((tmp_path / "ns" / "transforms.json").read_text())
+    with Image.open(tmp_path / "ns" / "images" / "a.jpg") as photo:
+        assert ImageOps.exif_transpose(photo).size == photo.size == (transforms["w"], transforms["h"])
+        assert photo.getexif().get(ORIENTATION, 1) == 1
+    if orientation != 2:  # the model's coordinates are those of the flipped photo then
+        camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 300, WIDTH, HEIGHT)
+        camera.params = params
+        x, y = camera.cam_from_img(np.array(DISC_PX))
+        expected = transforms["fl_x"] * x + transforms["cx"], transforms["fl_y"] * y + transforms["cy"]
+        np.testing.assert_allclose(find_disc(tmp_path / "ns" / "images" / "a.jpg"), expected, atol=0.3)
+
+
+def write_transparent(path: Path) -> None:
+    """The disc in front of nothing."""
+    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    Image.fromarray(np.dstack([grey, grey, grey, np.where(grey > 60, 255, 0).astype(np.uint8)])).save(path)
+
+
+@pytest.mark.parametrize("to", ["3dgs", "nerfstudio"])
+@pytest.mark.parametrize("k", [0.08, 0.0])
+def test_transparency_stays(tmp_path, to, k):
+    out = make_run(tmp_path, "SIMPLE_RADIAL", [300.0, 160.0, 120.0, k], ("a.png", "b.png"))
+    write_transparent(tmp_path / "photos" / "a.png")
+    convert_run(out, to, tmp_path / "to")
+    with Image.open(tmp_path / "to" / "images" / "a.png") as photo, Image.open(tmp_path / "to/images/b.png") as opaque:
+        assert (photo.mode, opaque.mode) == ("RGBA", "RGB") and photo.size == opaque.size
+        alpha = np.array(photo.getchannel("A"))
+    Image.fromarray(alpha).save(tmp_path / "alpha.png")
+    np.testing.assert_allclose(find_disc(tmp_path / "alpha.png"), find_disc(tmp_path / "to/images/b.png"), atol=0.3)
+    assert not (tmp_path / "to" / "masks").exists()
+
+
+def add_masks(tmp_path: Path, out: Path, names: tuple[str, ...]) -> Path:
+    """Masks in which the disc alone is not masked out, known to the run."""
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    for name in names:
+        grey = cv2.imread(str(tmp_path / "photos" / name), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(folder / f"{name}.png"), np.where(grey > 60, 255, 0).astype(np.uint8))
+    summary = json.loads((out / "summary.json").read_text()) | {"masks": {"folder": str(folder), "camera": ""}}
+    (out / "summary.json").write_text(json.dumps(summary))
+    return folder
+
+
+@pytest.mark.parametrize("k", [0.08, 0.0])
+def test_masks_become_files_for_nerfstudio_and_transparent_for_3dgs(tmp_path, k):
+    names = ("a.jpg", "b.jpg")
+    out = make_run(tmp_path, "SIMPLE_RADIAL", [300.0, 160.0, 120.0, k], names)
+    add_masks(tmp_path, out, names[:1])
+    convert_run(out, "nerfstudio", tmp_path / "ns")
+    frames = {f["file_path"]: f for f in json.loads((tmp_path / "ns" / "transforms.json").read_text())["frames"]}
+    assert {path: frame["mask_path"] for path, frame in frames.items()} == {
+        "images/a.jpg": "masks/a.jpg.png", "images/b.jpg": "masks/b.jpg.png",
+    }  # fmt: skip
+    place = find_disc(tmp_path / "ns" / "images" / "a.jpg")
+    np.testing.assert_allclose(find_disc(tmp_path / "ns" / "masks" / "a.jpg.png"), place, atol=0.3)
+    unmasked = cv2.imread(str(tmp_path / "ns" / "masks" / "b.jpg.png"), cv2.IMREAD_GRAYSCALE)
+    assert unmasked.shape == cv2.imread(str(tmp_path / "ns/images/b.jpg")).shape[:2] and unmasked.min() == 255
+
+    convert_run(out, "3dgs", tmp_path / "3dgs")
+    assert list_files(tmp_path / "3dgs" / "images") == {"a.jpg.png", "b.jpg"}
+    with Image.open(tmp_path / "3dgs" / "images" / "a.jpg.png") as photo:
+        photo.getchannel("A").save(tmp_path / "alpha.png")
+    np.testing.assert_allclose(find_disc(tmp_path / "alpha.png"), place, atol=0.3)
+    model = pycolmap.Reconstruction(tmp_path / "3dgs" / "sparse" / "0")
+    assert {image.name for image in model.images.values()} == {"a.jpg.png", "b.jpg"}
+
+
+def test_masks_that_were_moved(tmp_path):
+    out = make_run(tmp_path, "PINHOLE", [300.0, 310.0, 160.0, 120.0], ("a.png", "b.png"))
+    masks = add_masks(tmp_path, out, ("a.png", "b.png"))
+    moved = masks.rename(tmp_path / "moved")
+    with pytest.raises(InputError, match="made with the masks .*masks, which do not exist: name them with --masks"):
+        convert_run(out, "3dgs", tmp_path / "3dgs")
+    convert_run(out, "3dgs", tmp_path / "3dgs", masks=MaskConfig(str(moved)))
+    with Image.open(tmp_path / "3dgs" / "images" / "b.png") as photo:
+        assert photo.mode == "RGBA"
+
+
+# Large coordinates
+
+
+UTM = np.array([500000.0, 4649776.0, 120.0])
+
+
+@pytest.fixture
+def utm(out) -> Path:
+    """The run with its model moved to UTM coordinates."""
+    model = pycolmap.Reconstruction(out / "sparse" / "0")
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), UTM))
+    model.write_binary(out / "sparse" / "0")
+    return out
+
+
+def read_cloud(path: Path) -> np.ndarray:
+    """(N, 3) in the order of y."""
+    cloud = PlyData.read(path)["vertex"]
+    xyz = np.stack([cloud["x"], cloud["y"], cloud["z"]], axis=1)
+    return xyz[np.argsort(xyz[:, 1])]
+
+
+def read_points(folder: Path) -> np.ndarray:
+    xyz = np.array([point.xyz for point in pycolmap.Reconstruction(folder).points3D.values()])
+    return xyz[np.argsort(xyz[:, 1])]
+
+
+def test_a_ply_of_utm_coordinates_loses_nothing(utm, tmp_path):
+    convert_run(utm, "ply", tmp_path / "points.ply")
+    np.testing.assert_array_equal(read_cloud(tmp_path / "points.ply"), read_points(utm / "sparse" / "0"))
+
+
+def test_text_of_utm_coordinates_loses_nothing(utm, tmp_path):
+    convert_run(utm, "txt", tmp_path / "txt")
+    np.testing.assert_allclose(read_points(tmp_path / "txt"), read_points(utm / "sparse" / "0"), rtol=1e-15)
+
+
+@pytest.mark.parametrize("to", ["3dgs", "nerfstudio"])
+def test_models_for_single_precision_are_moved_and_say_so(utm, tmp_path, to, caplog):
+    convert_run(utm, to, tmp_path / "to")
+    offset = np.array(json.loads((tmp_path / "to" / "offset.json").read_text())["offset"])
+    assert np.abs(offset - UTM).max() < 20 and (offset == offset.round()).all()
+    assert [record.message[:33] for record in caplog.records] == ["the coordinates are too large for"]
+    source = pycolmap.Reconstruction(utm / "sparse" / "0")
+    centres = {image.name.replace("/", "_"): image.projection_center() for image in source.images.values()}
+    if to == "3dgs":
+        points = read_points(tmp_path / "to" / "sparse" / "0")
+        moved = {image.name: image.projection_center() for image in read_model(tmp_path / "to" / "sparse" / "0")}
+        moved = {name.removeprefix("_") if name == "_left_1.png" else name: xyz for name, xyz in moved.items()}
+        centres.pop("left_1.png"), moved.pop("left_1.png")
+    else:
+        points = read_cloud(tmp_path / "to" / "points3D.ply")
+        frames = json.loads((tmp_path / "to" / "transforms.json").read_text())["frames"]
+        moved = {
+            frame["file_path"][7:].replace("/", "_"): np.array(frame["transform_matrix"])[:3, 3] for frame in frames
+        }
+        centres.pop("left_1.png"), moved.pop("left_1.png")
+    np.testing.assert_allclose(points + offset, read_points(utm / "sparse" / "0"), atol=1e-6)
+    assert len(np.unique(points[:, 1].astype(np.float32))) == len(points)
+    assert moved.keys() == centres.keys()
+    for name, centre in centres.items():
+        np.testing.assert_allclose(moved[name].astype(np.float32) + offset, centre, atol=1e-5)
 
 
 @pytest.mark.parametrize("to", ["3dgs", "nerfstudio"])
@@ -283,17 +514,12 @@ def test_photos_that_are_elsewhere(out, tmp_path):
     assert not (tmp_path / "ns").exists()
 
 
-@pytest.mark.parametrize("to", ["3dgs", "nerfstudio"])
-def test_what_colmap_cannot_undistort(tmp_path, to):
-    out = make_run(tmp_path, "SIMPLE_RADIAL", [300.0, 160.0, 120.0, 0.08], ("1.png", "2.webp", "3.png", "4.webp"))
-    (tmp_path / "photos" / "2.webp").rename(tmp_path / "photos" / "2.HEIC")
-    model = pycolmap.Reconstruction(out / "sparse" / "0")
-    next(image for image in model.images.values() if image.name == "2.webp").name = "2.HEIC"
-    model.write_binary(out / "sparse" / "0")
-    with pytest.raises(InputError, match=r"cannot undistort photos of the kind of .*2.HEIC: convert the 2 of them to"):
-        convert_run(out, to, tmp_path / "target")
-    convert_run(out, "txt", tmp_path / "txt")
-    assert not (tmp_path / "target").exists() and (tmp_path / "txt" / "images.txt").exists()
+def test_kinds_that_colmap_cannot_read_become_jpegs(tmp_path):
+    out = make_run(tmp_path, "SIMPLE_RADIAL", [300.0, 160.0, 120.0, 0.08], ("1.png", "2.webp"))
+    convert_run(out, "3dgs", tmp_path / "3dgs")
+    assert list_files(tmp_path / "3dgs" / "images") == {"1.png", "2.webp.jpg"}
+    first, second = (find_disc(tmp_path / "3dgs" / "images" / name) for name in ("1.png", "2.webp.jpg"))
+    np.testing.assert_allclose(first, second, atol=0.3)
 
 
 def test_a_photo_that_cannot_be_read(out, tmp_path, capfd):

@@ -157,7 +157,7 @@ def _undistort_keypoints(model: pycolmap.Reconstruction, image: pycolmap.Image, 
     if not len(image.points2D):
         return
     rays = np.asarray(distorted.cam_ray_from_img(np.array([point.xy for point in image.points2D])))
-    xy = model.cameras[image.camera_id].img_from_cam(rays)  # NaN where there is none
+    xy = np.asarray(model.cameras[image.camera_id].img_from_cam(rays))  # NaN where there is none
     for index in range(len(image.points2D)):
         if np.isfinite(xy[index]).all():
             image.points2D[index].xy = xy[index]

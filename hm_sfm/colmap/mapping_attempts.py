@@ -15,7 +15,7 @@ from hm_sfm.colmap.camera_starts import CameraStart, find_doubtful, list_starts
 from hm_sfm.colmap.database import open_database
 from hm_sfm.colmap.mapping_task import Build, MappingTask
 from hm_sfm.colmap.model_judgement import ENOUGH_AGREEMENT, Judgement, find_undetermined, is_impossible, judge_model
-from hm_sfm.colmap.scaled_database import copy_scaled, needs_scaling, restore_px
+from hm_sfm.colmap.scaled_database import copy_scaled, needs_copy, restore_px
 
 logger = logging.getLogger(__name__)
 
@@ -195,7 +195,7 @@ def build_scaled(task: MappingTask, build: Build, folder: Path) -> list[pycolmap
     """What `build` makes of the database in px of the matching resolution, in px of the stored photos."""
     raw = folder / "mapper"
     raw.mkdir(parents=True)
-    if not needs_scaling(task.px_scale):
+    if not needs_copy(task.database, task.px_scale):
         return build(task, raw)
     scaled = folder / "scaled.db"
     copy_scaled(task.database, scaled, task.px_scale)

@@ -2,10 +2,13 @@
 
 COLMAP has one limit, in px, for all photos, and some that cannot be set at all. So whatever has a unit, cameras,
 keypoints and two-view geometries, is divided by each photo's scale first, and multiplied by it afterwards.
+
+Fisheye cameras with an unknown focal length are changed, too: COLMAP would look for the fundamental matrices of their
+pairs, which do not exist, and finds essential ones with any focal length.
 """
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,14 @@ from hm_sfm.colmap.database import open_database
 def needs_scaling(px_scale: Mapping[str, float]) -> bool:
     """Whether stored photos differ from the matching resolution. px_scale: by image name; 1 where it is left out."""
     return any(scale != 1.0 for scale in px_scale.values())
+
+
+def needs_copy(path: Path, px_scale: Mapping[str, float]) -> bool:
+    """Whether COLMAP needs a copy_scaled of a database. Raises InputError where there is no database."""
+    with open_database(path) as database:
+        cameras = database.read_all_cameras()
+    unknown = any(camera.is_perspective_fisheye() and not camera.has_prior_focal_length for camera in cameras)
+    return unknown or needs_scaling(px_scale)
 
 
 def scale_camera(camera: pycolmap.Camera, px_scale: float) -> pycolmap.Camera:
@@ -32,12 +43,15 @@ def scale_camera(camera: pycolmap.Camera, px_scale: float) -> pycolmap.Camera:
 def copy_scaled(path: Path, target: Path, px_scale: Mapping[str, float]) -> None:
     """Copy a database; cameras, keypoints and two-view geometries of the copy are px of the matching resolution.
 
-    px_scale: by image name, px of the stored image per px of the matching resolution; 1 where it is left out. Images
-    that share a camera are of one size, and so have one scale. Raises InputError where there is no database.
+    The focal lengths of fisheye cameras count as known in it. px_scale: by image name, px of the stored image per px of
+    the matching resolution; 1 where it is left out. Images that share a camera are of one size, and so have one scale.
+    Raises InputError where there is no database.
     """
-    with open_database(path):
-        pass  # checks that it is there
+    with open_database(path) as database:
+        fisheye = [camera for camera in database.read_all_cameras() if camera.is_perspective_fisheye()]
     shutil.copy(path, target)
+    if fisheye:
+        claim_focal_lengths(target, [camera.camera_id for camera in fisheye])
     if not needs_scaling(px_scale):
         return
     with pycolmap.Database.open(target) as database, pycolmap.DatabaseTransaction(database):
@@ -53,6 +67,15 @@ def copy_scaled(path: Path, target: Path, px_scale: Mapping[str, float]) -> None
             id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
             scale_geometry(geometry, scale_of_image[id0], scale_of_image[id1])
             database.update_two_view_geometry(id0, id1, geometry)
+
+
+def claim_focal_lengths(path: Path, camera_ids: Sequence[int]) -> None:
+    """Take the focal lengths of these cameras for known. Raises InputError where there is no database."""
+    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
+        for camera_id in camera_ids:
+            camera = database.read_camera(camera_id)
+            camera.has_prior_focal_length = True
+            database.update_camera(camera)
 
 
 def scale_geometry(geometry: pycolmap.TwoViewGeometry, px_scale0: float, px_scale1: float) -> None:

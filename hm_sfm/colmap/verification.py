@@ -15,7 +15,7 @@ import pycolmap
 from tqdm import tqdm
 
 from hm_sfm.colmap.database import open_database
-from hm_sfm.colmap.scaled_database import copy_scaled, needs_scaling, scale_camera, scale_geometry
+from hm_sfm.colmap.scaled_database import claim_focal_lengths, copy_scaled, needs_copy, scale_camera, scale_geometry
 from hm_sfm.config import VerificationConfig
 from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.types import ImagePair, ImageRef, PairMatches, PatchMatches, freeze_array
@@ -223,10 +223,8 @@ def verify_database(
     verify = partial(_verify_missing, config=config, seed=seed, num_threads=num_threads)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
         copy = Path(folder) / "copy.db"
-        fisheye = _list_unfocused_fisheye(path)
-        if fisheye or needs_scaling(px_scale):
+        if needs_copy(path, px_scale):
             copy_scaled(path, copy, px_scale)
-            _claim_focal_lengths(copy, fisheye)
             verify(copy)
             _copy_geometries(copy, path, px_scale)
         else:
@@ -234,7 +232,7 @@ def verify_database(
         planar, cameras = _list_unfocused_planar(path)
         if planar:
             copy_scaled(path, copy, px_scale)
-            _claim_focal_lengths(copy, [*cameras, *fisheye])
+            claim_focal_lengths(copy, cameras)
             _forget(copy, planar)
             verify(copy)
             _add_inliers(copy, path, planar)
@@ -269,22 +267,6 @@ def _list_unfocused_planar(path: Path) -> tuple[list[tuple[int, int]], list[int]
         rows = zip(*database.read_two_view_geometries())
         planar = [pycolmap.pair_id_to_image_pair(row) for row, geometry in rows if geometry.config in PLANAR_KINDS]
     return [pair for pair in planar if images.intersection(pair)], sorted(unknown)
-
-
-def _list_unfocused_fisheye(path: Path) -> list[int]:
-    """The ids of the fisheye cameras without a known focal length."""
-    with open_database(path) as database:
-        cameras = database.read_all_cameras()
-    return [c.camera_id for c in cameras if c.is_perspective_fisheye() and not c.has_prior_focal_length]
-
-
-def _claim_focal_lengths(path: Path, camera_ids: Sequence[int]) -> None:
-    """Take the focal lengths of these cameras for known."""
-    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
-        for camera_id in camera_ids:
-            camera = database.read_camera(camera_id)
-            camera.has_prior_focal_length = True
-            database.update_camera(camera)
 
 
 def _forget(path: Path, pairs: Sequence[tuple[int, int]]) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from hm_sfm.colmap import mapping_attempts
 from hm_sfm.colmap.camera_starts import find_doubtful, split_cameras
-from hm_sfm.colmap.cameras import Cameras
+from hm_sfm.colmap.cameras import Cameras, guess_focal_px
 from hm_sfm.colmap.database import open_database, write_database
 from hm_sfm.colmap.mapping import MappingTask, map_images, map_incrementally
 from hm_sfm.colmap.model_judgement import find_undetermined, is_impossible, judge_model
@@ -34,14 +34,16 @@ class Scene:
     cam_from_world: tuple[np.ndarray, ...]
 
 
-def take_photos(points: np.ndarray, poses: Sequence[np.ndarray], focal_px: Sequence[float], noise_px: float) -> Scene:
-    """points: (P, 3). poses: (3, 4) each, cam_from_world. focal_px: of each photo; the lens is without distortion."""
+def take_photos(
+    points: np.ndarray, poses: Sequence[np.ndarray], lenses: Sequence[pycolmap.Camera], noise_px: float
+) -> Scene:
+    """points: (P, 3). poses: (3, 4) each, cam_from_world. lenses: one for each photo."""
     rng = np.random.default_rng(1)
     images, keypoints, seen_by = [], [], []
-    for number, (pose, focal) in enumerate(zip(poses, focal_px, strict=True)):
-        camera = points @ pose[:, :3].T + pose[:, 3]
-        xy = camera[:, :2] / camera[:, 2:] * focal + np.array(SIZE_WH) / 2
-        seen = np.flatnonzero(np.all((xy > 0) & (xy < SIZE_WH), axis=1) & (camera[:, 2] > 0))
+    for number, (pose, lens) in enumerate(zip(poses, lenses, strict=True)):
+        in_camera = points @ pose[:, :3].T + pose[:, 3]
+        xy = np.array(lens.img_from_cam(in_camera))
+        seen = np.flatnonzero(np.all((xy > 0) & (xy < SIZE_WH), axis=1) & (in_camera[:, 2] > 0))
         xy = xy[seen] + rng.normal(0, noise_px, (len(seen), 2))
         images.append(ImageRef(f"{number}.jpg", Path(f"{number}.jpg"), SIZE_WH))
         keypoints.append(Keypoints(f"{number}.jpg", xy, np.ones(len(seen)), np.ones(len(seen))))
@@ -67,16 +69,22 @@ def look_at(centre: Sequence[float], target: Sequence[float], roll_deg: float) -
 
 def make_street(zooms: Sequence[float] = (1.0,) * 6) -> Scene:
     """Deep: photos along a line, which look at different points."""
-    points = np.random.default_rng(0).uniform((-5, -3, 5), (5, 3, 12), (400, 3))
+    return take_street_photos([make_camera(FOCAL_PX * zoom, prior=True) for zoom in zooms], (5, 3))
+
+
+def take_street_photos(lenses: Sequence[pycolmap.Camera], half_size: tuple[float, float]) -> Scene:
+    """half_size: of the street, across the view."""
+    x, y = half_size
+    points = np.random.default_rng(0).uniform((-x, -y, 5), (x, y, 12), (400, 3))
     poses = [
         look_at(
             (x, 0.4 * np.sin(2 * x), 0.5 * np.cos(3 * x)),
             (0.6 * x + 0.5 * np.sin(5 * x), 0.3 * np.cos(4 * x), 8),
             9 * x,
         )
-        for x in np.linspace(-2.4, 2.4, len(zooms))
+        for x in np.linspace(-2.4, 2.4, len(lenses))
     ]
-    return take_photos(points, poses, [FOCAL_PX * zoom for zoom in zooms], 0.2)
+    return take_photos(points, poses, lenses, 0.2)
 
 
 def make_flight() -> Scene:
@@ -86,7 +94,7 @@ def make_flight() -> Scene:
     poses = [
         np.column_stack([rotation, -rotation @ np.array([x, y, 6.0])]) for x in (-2.0, 0.0, 2.0) for y in (-1.5, 1.0)
     ]
-    return take_photos(points, poses, [FOCAL_PX] * len(poses), 0.1)
+    return take_photos(points, poses, [make_camera(FOCAL_PX, prior=True)] * len(poses), 0.1)
 
 
 def make_camera(focal_px: float, prior: bool) -> pycolmap.Camera:
@@ -187,6 +195,18 @@ def test_zoomed_photos_get_cameras_of_their_own(tmp_path, attempts, caplog, prio
     # The database has the cameras of the model: COLMAP's own mapper can go on from it.
     stored = {camera.camera_id for camera in read_cameras(tmp_path)}
     assert stored == {image.camera_id for image in model.images.values()} and len(stored) == 6
+
+
+def test_fisheye_photos_need_no_focal_length(tmp_path, attempts, caplog):
+    model = pycolmap.CameraModelId.OPENCV_FISHEYE
+    lens = pycolmap.Camera.create_from_model_id(1, model, 281.0, *SIZE_WH)  # a view of 130 degrees
+    scene = take_street_photos([lens] * 6, (14, 9))
+    guess = pycolmap.Camera.create_from_model_id(1, model, guess_focal_px(model, SIZE_WH), *SIZE_WH)
+    (reconstruction,) = reconstruct(tmp_path, scene, guess)
+    assert measure_worst_rotation(reconstruction, scene) < 0.15
+    np.testing.assert_allclose(reconstruction.camera(1).params[:4], lens.params[:4], rtol=0.02)
+    assert attempts == ["as given"] and caplog.messages == []
+    assert not read_cameras(tmp_path)[0].has_prior_focal_length
 
 
 def test_cameras_stay_shared_where_that_was_asked_for(tmp_path, attempts, caplog):

@@ -83,7 +83,9 @@ def calibrate_rigs(task: MappingTask, rigs: Sequence[pycolmap.RigConfig]) -> boo
         shutil.copy(database_path, own_copy)
         with quiet_colmap(pycolmap.logging.FATAL), pycolmap.Database.open(own_copy) as database:
             pycolmap.apply_rig_config([], database)
-        without_rigs = replace(task, database=own_copy, sparse_folder=work_folder / "sparse", on_image=None)
+        without_rigs = replace(
+            task, database=own_copy, sparse_folder=work_folder / "sparse", split_cameras=False, on_image=None
+        )
         models = map_by_config(without_rigs)
         with quiet_colmap(pycolmap.logging.FATAL), pycolmap.Database.open(own_copy) as database:
             if models:

@@ -182,6 +182,7 @@ def test_pairs_contradict_a_focal_length_that_is_far_off(tmp_path, factor, doubt
 ZOOMS = (1.0, 1.6, 1.0, 2.0, 1.3, 1.6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prior", [True, False], ids=["exif", "guess"])
 def test_zoomed_photos_get_cameras_of_their_own(tmp_path, attempts, caplog, prior):
     scene = make_street(ZOOMS)
@@ -209,6 +210,7 @@ def test_fisheye_photos_need_no_focal_length(tmp_path, attempts, caplog):
     assert not read_cameras(tmp_path)[0].has_prior_focal_length
 
 
+@pytest.mark.slow
 def test_cameras_stay_shared_where_that_was_asked_for(tmp_path, attempts, caplog):
     models = reconstruct(tmp_path, make_street(ZOOMS), make_camera(576.0, False), split_cameras=False)
     assert "a camera for each photo" not in attempts and len(attempts) == 4

@@ -272,6 +272,7 @@ def map_scaled(folder: Path, oracle: Oracle, scales: list[float], task: MappingT
     return Result(models, inliers, px_scale, keypoints)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mapper", ["incremental", "global"])
 def test_the_model_does_not_depend_on_the_size_of_the_photos(tmp_path, oracle, mapper):
     noisy = add_noise(oracle, 0.7)  # of some observations more than the 3 px that are allowed if it counts six times

@@ -35,7 +35,8 @@ def scale_camera(camera: pycolmap.Camera, px_scale: float) -> pycolmap.Camera:
     scaled = pycolmap.Camera(camera.todict())
     scaled.width, scaled.height = (max(1, round(size / px_scale)) for size in (camera.width, camera.height))
     params = np.array(camera.params)
-    params[[*camera.focal_length_idxs(), *camera.principal_point_idxs()]] /= px_scale
+    in_px = (*camera.focal_length_idxs(), *camera.principal_point_idxs(), *camera.metadata_params_idxs())
+    params[list(in_px)] /= px_scale
     scaled.params = params.tolist()
     return scaled
 

@@ -7,6 +7,7 @@ import pycolmap
 import pytest
 
 from hm_sfm.colmap.cameras import make_cameras
+from hm_sfm.colmap.scaled_database import scale_camera
 from hm_sfm.config import CameraConfig
 from hm_sfm.photos.exif import write_jpeg
 from hm_sfm.photos.images import read_ref
@@ -55,3 +56,19 @@ def test_the_first_guess_spans_the_view_of_a_usual_lens_of_its_kind(tmp_path, mo
     cosine = edges[0] @ edges[1] / np.prod(np.linalg.norm(edges, axis=1))
     assert np.degrees(np.arccos(cosine)) == pytest.approx(view_deg, abs=1)
     assert isinstance(camera, pycolmap.Camera) and not camera.has_prior_focal_length
+
+
+MODELS = [model for model in pycolmap.CameraModelId.__members__.values() if model != pycolmap.CameraModelId.INVALID]
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.name)
+def test_a_reduced_photo_shows_the_same_at_reduced_places(model):
+    camera = pycolmap.Camera.create_from_model_id(1, model, 500.0, 640, 480)
+    params = np.array(camera.params)
+    params[list(camera.extra_params_idxs())] += 0.01  # distorted
+    camera.params = params.tolist()
+    points = np.random.default_rng(0).uniform((-2, -1, 4), (2, 1, 6), (20, 3))
+    scaled = scale_camera(camera, 4.0)
+    assert (scaled.width, scaled.height) == (160, 120) and scaled.model == model
+    np.testing.assert_allclose(scaled.img_from_cam(points), np.array(camera.img_from_cam(points)) / 4, atol=1e-9)
+    np.testing.assert_allclose(scale_camera(scaled, 0.25).params, camera.params)

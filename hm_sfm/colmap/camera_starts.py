@@ -3,7 +3,6 @@
 They are written into copies of a verified database.
 """
 
-import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ import numpy as np
 import pycolmap
 
 from hm_sfm.colmap.cameras import FOCAL_RATIOS, guess_focal_px
-from hm_sfm.colmap.database import open_database
+from hm_sfm.colmap.database import copy_database, open_database
 
 WIDER, LONGER = 0.6, 1.8
 """Guesses of focal lengths beside the first one, relative to it."""
@@ -70,7 +69,7 @@ def estimate_focal_lengths(path: Path, split: bool = False) -> None:
     if split:
         split_cameras(path)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".calibration.") as folder:
-        copy = Path(shutil.copy(path, Path(folder) / "copy.db"))  # calibration changes its two-view geometries
+        copy = copy_database(path, Path(folder) / "copy.db")  # calibration changes its two-view geometries
         low, high = FOCAL_RATIOS
         options = pycolmap.ViewGraphCalibrationOptions(
             random_seed=0, reestimate_relative_pose=False, min_focal_length_ratio=low, max_focal_length_ratio=high

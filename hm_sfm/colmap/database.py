@@ -4,7 +4,10 @@ All of it goes through pycolmap.
 """
 
 import os
+import shutil
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -66,8 +69,7 @@ def write_database(
         if cameras.rigs:
             with pycolmap.Database.open(temporary) as database, pycolmap.DatabaseTransaction(database), quiet_colmap():
                 pycolmap.apply_rig_config(list(cameras.rigs), database)
-        _remove_leftovers(path)
-        os.replace(temporary, path)
+        replace_database(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
         _remove_leftovers(temporary)
@@ -102,6 +104,33 @@ def _check_matches(matches: IndexMatches, keypoints: Sequence[Keypoints], image_
 def _remove_leftovers(path: Path) -> None:
     for ending in SQLITE_LEFTOVERS:
         path.with_name(path.name + ending).unlink(missing_ok=True)
+
+
+def copy_database(path: Path, target: Path) -> Path:
+    """Copy a database to a new file, with all that has been written to it by now; returns the new path.
+
+    A program that has it open, such as COLMAP's GUI, keeps the latest in a file beside it. Raises InputError where
+    there is no database, or it cannot be read as SQLite.
+    """
+    if not path.is_file():
+        raise InputError(f"there is no database {path}")
+    beside = [path.with_name(path.name + ending) for ending in SQLITE_LEFTOVERS]
+    if not any(file.is_file() and file.stat().st_size for file in beside):
+        shutil.copy(path, target)  # reading by SQLite would leave a file beside it
+        return target
+    try:
+        uri = f"{path.absolute().as_uri()}?mode=ro"
+        with closing(sqlite3.connect(uri, uri=True)) as source, closing(sqlite3.connect(target)) as copy:
+            source.backup(copy)
+    except sqlite3.Error as error:
+        raise InputError(f"cannot read the database {path}, which is in use: {error}") from error
+    return target
+
+
+def replace_database(new: Path, path: Path) -> None:
+    """Move a closed database to the place of another one, on the same disk."""
+    _remove_leftovers(path)
+    os.replace(new, path)
 
 
 def open_database(path: Path) -> pycolmap.Database:

@@ -6,7 +6,6 @@ appears at once and complete, or not at all.
 """
 
 import logging
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -20,13 +19,15 @@ import pycolmap
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from hm_sfm.colmap.alignment import keep_frame
 from hm_sfm.colmap.cameras import Cameras
-from hm_sfm.colmap.database import open_database
+from hm_sfm.colmap.database import copy_database, open_database, replace_database
 from hm_sfm.colmap.mapping_attempts import build_scaled, find_models, sort_models
 from hm_sfm.colmap.mapping_task import MappingTask
+from hm_sfm.colmap.model_folders import replace_models, restore_models
 from hm_sfm.colmap.rigs import lack_poses
 from hm_sfm.colmap.scaled_database import needs_scaling
-from hm_sfm.colmap.snapshots import SNAPSHOT_FOLDER, Snapshots, digest_inputs
+from hm_sfm.colmap.snapshots import SNAPSHOT_FOLDER, Snapshots, digest_inputs, discard_snapshots
 from hm_sfm.io.colmap_log import quiet_colmap
 from hm_sfm.photos.bitmaps import open_to_colmap
 from hm_sfm.types import ImageRef, MappingResult
@@ -80,7 +81,7 @@ def calibrate_rigs(task: MappingTask, rigs: Sequence[pycolmap.RigConfig]) -> boo
     database_path = Path(task.database)
     with _make_work_folder(database_path.parent, ".rigs.") as work_folder:
         own_copy = work_folder / "database.db"
-        shutil.copy(database_path, own_copy)
+        copy_database(database_path, own_copy)
         with quiet_colmap(pycolmap.logging.FATAL), pycolmap.Database.open(own_copy) as database:
             pycolmap.apply_rig_config([], database)
         without_rigs = replace(
@@ -94,7 +95,7 @@ def calibrate_rigs(task: MappingTask, rigs: Sequence[pycolmap.RigConfig]) -> boo
             is_complete = bool(sensors) and all(pose is not None for pose in sensors)
             if not is_complete:
                 pycolmap.apply_rig_config([], database)
-        os.replace(own_copy, database_path)
+        replace_database(own_copy, database_path)
     if not is_complete:
         logger.warning(
             "the rigs are left out: no model has photos of all their cameras, from which the missing "
@@ -116,7 +117,7 @@ def map_incrementally(task: MappingTask) -> tuple[pycolmap.Reconstruction, ...]:
     on from there after it was killed; snapshots of another database or configuration are not used.
 
     Returns the models, most registered images first, then most points; the sparse folder has them in this order.
-    Without a model there is no folder. Raises InputError where there is no database.
+    Without a model, what was there stays. Raises InputError where there is no database.
     """
     return _write_models(task, partial(find_models, task, _run_mapper, _map_leftovers))
 
@@ -145,23 +146,27 @@ def triangulate_images(
     Returns one model with all images, or none where there are no points; the sparse folder is as map_incrementally
     leaves it. Raises InputError where there is no database.
     """
-    known = replace(task, fix_intrinsics=True)
-    return _write_models(task, partial(build_scaled, known, partial(_run_triangulator, images, cameras)))
+    build = partial(_run_triangulator, images, cameras)
+    return _write_models(task, partial(build_scaled, replace(task, fix_intrinsics=True), build), has_frame=True)
 
 
 def _write_models(
-    task: MappingTask, find: Callable[[Path], list[pycolmap.Reconstruction]]
+    task: MappingTask, find: Callable[[Path], list[pycolmap.Reconstruction]], has_frame: bool = False
 ) -> tuple[pycolmap.Reconstruction, ...]:
-    """Sort the models that `find` makes, given a folder to work in, and put them in the sparse folder's place.
+    """Sort the models that `find` makes, given a folder to work in, and write them to the sparse folder.
 
-    Snapshots of them are then removed, and so is what killed processes left. Without verified matches there is nothing
-    to build. Raises InputError where there is no database.
+    They are moved to the frame of the models that are there, unless has_frame says that they have one of their own, and
+    replace them, see replace_models. Snapshots of them are then removed, and so is what killed processes left. Without
+    verified matches there is nothing to build. Raises InputError where there is no database.
     """
     sparse_folder = Path(task.sparse_folder)
     sparse_folder.parent.mkdir(parents=True, exist_ok=True)
     with open_database(task.database) as database:
         can_map = database.num_inlier_matches() > 0  # rejected pairs count as verified pairs, without inliers
-    with _make_work_folder(sparse_folder.parent, f".{sparse_folder.name}.") as work_folder:
+    prefix = f".{sparse_folder.name}."
+    for left in sparse_folder.parent.glob(f"{prefix}*/"):
+        restore_models(sparse_folder, left)
+    with _make_work_folder(sparse_folder.parent, prefix) as work_folder:
         models: list[pycolmap.Reconstruction] = []
         if can_map:
             # The one error that COLMAP logs here is that there is no model, which the caller is told anyway.
@@ -169,18 +174,10 @@ def _write_models(
                 models = find(work_folder)
         sort_models(models)
 
-        finished = work_folder / "sparse"
-        for number, model in enumerate(models):
-            folder = finished / str(number)
-            folder.mkdir(parents=True)
-            model.write_binary(folder)
-        if sparse_folder.exists():
-            os.replace(sparse_folder, work_folder / "replaced")
-        if models:
-            os.replace(finished, sparse_folder)
-        snapshots = sparse_folder.with_name(SNAPSHOT_FOLDER)
-        if snapshots.exists():  # all of them at once: none is left with files missing
-            os.replace(snapshots, work_folder / "snapshots")
+        if not has_frame:
+            keep_frame(models, sparse_folder)
+        replace_models(models, sparse_folder, work_folder)
+        discard_snapshots(sparse_folder.with_name(SNAPSHOT_FOLDER), work_folder / SNAPSHOT_FOLDER)
     return tuple(models)
 
 
@@ -295,7 +292,7 @@ def _run_global_mapper(task: MappingTask, output_folder: Path) -> list[pycolmap.
     # anything: the first guess, which adjustment refines, is then the better start.
     for calibrate in (True, False) if unknown_focal else (False,):
         own_copy = output_folder / "database.db"  # calibration writes to it
-        shutil.copy(task.database, own_copy)
+        copy_database(task.database, own_copy)
         if calibrate:
             long_edge_px = max(max(camera.width, camera.height) for camera in cameras)
             max_error_px = task.max_error_px / 1000 * long_edge_px

@@ -1,8 +1,6 @@
 """Mapping from one first guess of the cameras after another, until the model is good."""
 
 import logging
-import os
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -12,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from hm_sfm.colmap.camera_starts import CameraStart, find_doubtful, list_starts
-from hm_sfm.colmap.database import open_database
+from hm_sfm.colmap.database import copy_database, open_database, replace_database
 from hm_sfm.colmap.mapping_task import Build, MappingTask
 from hm_sfm.colmap.model_judgement import ENOUGH_AGREEMENT, Judgement, find_undetermined, is_impossible, judge_model
 from hm_sfm.colmap.scaled_database import copy_scaled, needs_copy, restore_px
@@ -64,7 +62,7 @@ def find_models(
     leftovers = build_scaled(best.task, partial(map_leftovers, registered), work_folder / "leftovers")
     models = [*best.models, *leftovers]
     if best.start and models:
-        os.replace(best.task.database, task.database)
+        replace_database(best.task.database, task.database)
     if best.task.fix_intrinsics:
         return models
     models = _drop_impossible(models)
@@ -133,7 +131,7 @@ def _attempt(task: MappingTask, start: CameraStart | None, build: Build, folder:
     """Build models from one start. folder: a new one, which then holds the database of the start."""
     folder.mkdir()
     if start:
-        own_copy = Path(shutil.copy(task.database, folder / "database.db"))
+        own_copy = copy_database(task.database, folder / "database.db")
         start.apply(own_copy)
         task = replace(task, database=own_copy)
     models = build_scaled(task, build, folder)

@@ -17,7 +17,7 @@ class MappingTask:
     image_folder: Path
     """For the colours of the points."""
     sparse_folder: Path
-    """The models go to its subfolders 0, 1, ..., as COLMAP binary; what it held before is gone then."""
+    """The models go to its subfolders 0, 1, ..., as COLMAP binary, see replace_models."""
     config: MappingConfig = field(default_factory=MappingConfig)
     max_error_px: float = VerificationConfig().max_error_px
     """Px of the matching resolution: observations farther than this from their point are dropped. COLMAP's own 4 px are

@@ -7,14 +7,13 @@ Fisheye cameras with an unknown focal length are changed, too: COLMAP would look
 pairs, which do not exist, and finds essential ones with any focal length.
 """
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from hm_sfm.colmap.database import open_database
+from hm_sfm.colmap.database import copy_database, open_database
 
 
 def needs_scaling(px_scale: Mapping[str, float]) -> bool:
@@ -50,7 +49,7 @@ def copy_scaled(path: Path, target: Path, px_scale: Mapping[str, float]) -> None
     """
     with open_database(path) as database:
         fisheye = [camera for camera in database.read_all_cameras() if camera.is_perspective_fisheye()]
-    shutil.copy(path, target)
+    copy_database(path, target)
     if fisheye:
         claim_focal_lengths(target, [camera.camera_id for camera in fisheye])
     if not needs_scaling(px_scale):

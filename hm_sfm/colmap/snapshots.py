@@ -5,6 +5,8 @@ what the model is made from and how many images it has: nothing half-written is 
 """
 
 import hashlib
+import os
+import re
 import shutil
 from pathlib import Path
 
@@ -58,8 +60,22 @@ class Snapshots:
             self.newest = self.folder / f"{self.made_from}.{self.registered}"
             self.stored = self.registered
             move_folder(written, self.newest)
-            for older in set(self.folder.iterdir()) - {self.newest}:
+            for older in set(list_snapshots(self.folder)) - {self.newest}:
                 shutil.rmtree(older)
+
+
+def list_snapshots(folder: Path) -> list[Path]:
+    """The finished snapshots in a folder, of whatever they were made from; what else is there is not ours."""
+    return [path for path in folder.glob("*/") if re.fullmatch(r"[0-9a-f]+\.[0-9]+", path.name)]
+
+
+def discard_snapshots(folder: Path, work_folder: Path) -> None:
+    """Move all snapshots to a new folder on the same disk, which is to be removed: none is left with files missing."""
+    work_folder.mkdir()
+    for path in list_snapshots(folder):
+        os.replace(path, work_folder / path.name)
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def digest_inputs(database_path: Path, config: MappingConfig, max_error_px: float, fix_intrinsics: bool) -> str:

@@ -12,6 +12,7 @@ import pycolmap
 
 from hm_sfm.colmap.database import open_database
 from hm_sfm.colmap.mapping import summarise_models
+from hm_sfm.colmap.model_folders import count_latest
 from hm_sfm.colmap.models import read_tracks
 from hm_sfm.config import Config, fingerprint
 from hm_sfm.evaluation.poses import score_model
@@ -93,7 +94,7 @@ def finish_method(task: ComparisonTask, method: Method) -> MethodResult:
         matched = np.diff(read_matched_tracks(folder / "database.db").offsets)
         finished = {
             "made_by": made_by,
-            "models": count_models(folder),
+            "models": count_latest(folder / "sparse"),
             "seconds": seconds,
             "matched_tracks": len(matched),
             "mean_matched_track_length": float(matched.mean()) if len(matched) else 0.0,
@@ -119,15 +120,10 @@ def read_finished(folder: Path, made_by: str) -> dict[str, Any] | None:
     """The content of RESULT_FILE; None where it is missing, unreadable, of other settings, or without its models."""
     try:
         finished = json.loads((folder / RESULT_FILE).read_text())
-        same = (finished["made_by"], finished["models"]) == (made_by, count_models(folder))
+        same = (finished["made_by"], finished["models"]) == (made_by, count_latest(folder / "sparse"))
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return finished if same else None
-
-
-def count_models(folder: Path) -> int:
-    """Models in `folder`/sparse."""
-    return len(list((folder / "sparse").glob("*/points3D.bin")))
 
 
 def measure_method(task: ComparisonTask, name: str, finished: Mapping[str, Any]) -> MethodResult:

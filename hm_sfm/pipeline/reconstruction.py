@@ -115,7 +115,9 @@ def build_model(run: Run) -> MappingResult:
     for diagnosis in diagnoses:
         logger.warning("%s", diagnosis)
     if not models:
+        earlier = run.out / "sparse" / "0"
+        also = f", and so is the model of an earlier run, {earlier}" if earlier.is_dir() else ""
         raise NoModelError(
-            f"no model could be built from {len(run.images)} images; matches and database are kept in {run.out}"
+            f"no model could be built from {len(run.images)} images; matches and database are kept in {run.out}{also}"
         )
     return result

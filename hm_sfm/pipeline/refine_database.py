@@ -6,7 +6,6 @@ our own, with the matched keypoints of the database as the seeds of tracks. Its 
 
 import dataclasses
 import logging
-import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 import pycolmap
 
 from hm_sfm.colmap.cameras import Cameras
-from hm_sfm.colmap.database import open_database, read_verified_matches
+from hm_sfm.colmap.database import copy_database, open_database, read_verified_matches
 from hm_sfm.config import Config
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.formats.hloc import name_group
@@ -84,11 +83,9 @@ def refine_database(
 
 def read_database(path: Path, image_folder: Path) -> DatabaseContent:
     """The photos, cameras, keypoints and verified matches of a database. Raises InputError as refine_database does."""
-    if not path.is_file():
-        raise InputError(f"there is no database {path}")
     # COLMAP brings databases of earlier versions up to date as it opens them: not this one.
     with tempfile.TemporaryDirectory() as folder:
-        copy = Path(shutil.copy(path, Path(folder) / "copy.db"))
+        copy = copy_database(path, Path(folder) / "copy.db")
         try:
             with quiet_colmap(pycolmap.logging.FATAL), open_database(copy) as database:
                 rows = sorted(database.read_all_images(), key=lambda row: row.name)

@@ -7,8 +7,9 @@ import pycolmap
 import pytest
 from PIL import Image
 
+import hm_sfm
 from hm_sfm.colmap.cameras import Cameras, make_cameras
-from hm_sfm.colmap.database import open_database, write_database
+from hm_sfm.colmap.database import copy_database, open_database, replace_database, write_database
 from hm_sfm.config import CameraConfig
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.photos.exif import write_jpeg
@@ -405,3 +406,57 @@ def test_reading_ids_of_a_missing_database_does_not_create_it(tmp_path):
     with pytest.raises(InputError, match="missing.db"):
         open_database(tmp_path / "missing.db")
     assert not list(tmp_path.iterdir())
+
+
+def write_empty(path: Path, count: int) -> None:
+    images = [ImageRef(f"{number}.jpg", Path("x.jpg"), (60, 40)) for number in range(count)]
+    camera = pycolmap.Camera.create_from_model_name(1, "PINHOLE", 50.0, 60, 40)
+    write_database(path, images, Cameras((camera,), (0,) * count), [make_keypoints(i.name, 1) for i in images], [])
+
+
+def test_a_copy_of_a_database_in_use_has_all_that_was_written(tmp_path):
+    """COLMAP keeps the latest in database.db-wal for as long as it has the database open."""
+    path = tmp_path / "a database?.db"
+    write_empty(path, 3)
+    with pycolmap.Database.open(path) as in_use:
+        in_use.write_image(pycolmap.Image(name="new.jpg", camera_id=1, image_id=9), use_image_id=True)
+        before = path.read_bytes()
+        assert copy_database(path, tmp_path / "copy.db") == tmp_path / "copy.db"
+        assert path.read_bytes() == before
+        assert in_use.num_images() == 4
+    assert list_image_ids(tmp_path / "copy.db") == {"0.jpg": 1, "1.jpg": 2, "2.jpg": 3, "new.jpg": 9}
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a database?.db", "copy.db"]
+
+
+def test_copying_leaves_nothing_beside_a_database(tmp_path):
+    write_empty(tmp_path / "database.db", 3)
+    before = (tmp_path / "database.db").read_bytes()
+    copy_database(tmp_path / "database.db", tmp_path / "copy.db")
+    assert (tmp_path / "copy.db").read_bytes() == (tmp_path / "database.db").read_bytes() == before
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["copy.db", "database.db"]
+
+
+def test_what_cannot_be_copied(tmp_path):
+    with pytest.raises(InputError, match=r"there is no database .*none\.db"):
+        copy_database(tmp_path / "none.db", tmp_path / "copy.db")
+    (tmp_path / "text.db").write_text("no database" * 100)
+    (tmp_path / "text.db-wal").write_text("nor this")
+    with pytest.raises(
+        InputError, match=r"cannot read the database .*text\.db, which is in use: file is not a database"
+    ):
+        copy_database(tmp_path / "text.db", tmp_path / "copy.db")
+
+
+def test_a_database_that_replaces_another_does_not_get_its_leftovers(tmp_path):
+    write_empty(tmp_path / "new.db", 2)
+    write_empty(tmp_path / "old.db", 3)
+    (tmp_path / "old.db-wal").write_bytes(b"of a writer that was killed")
+    replace_database(tmp_path / "new.db", tmp_path / "old.db")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["old.db"]
+    assert len(list_image_ids(tmp_path / "old.db")) == 2
+
+
+def test_databases_are_copied_in_one_place_only():
+    package = Path(hm_sfm.__file__).parent
+    copying = {path.name for path in package.rglob("*.py") if "shutil.copy(" in path.read_text()}
+    assert copying == {"database.py", "models.py"}  # the latter: files of models

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from hm_sfm.colmap.snapshots import Snapshots
+from hm_sfm.colmap.snapshots import Snapshots, discard_snapshots
 
 
 def write_snapshot(growing: Path, content: str) -> None:
@@ -51,3 +51,20 @@ def test_one_that_was_made_from_something_else_is_not_used(tmp_path):
     write_snapshot(snapshots.growing, "first")
     snapshots.add_image()
     assert [path.name for path in (tmp_path / "snapshots").iterdir()] == ["bb.3"]
+
+
+def test_what_others_put_there_stays(tmp_path):
+    """COLMAP names its own snapshots after the time."""
+    for name in ("00001732900000", "mine", "aa.9"):
+        (tmp_path / "snapshots" / name).mkdir(parents=True)
+    (tmp_path / "snapshots" / "notes.txt").write_text("mine")
+    snapshots = start(tmp_path, "aa", 1)
+    snapshots.begin_model()
+    write_snapshot(snapshots.growing, "more")
+    snapshots.add_image()
+    left = {"00001732900000", "mine", "notes.txt"}
+    assert {path.name for path in (tmp_path / "snapshots").iterdir()} == {*left, "aa.10"}
+    discard_snapshots(tmp_path / "snapshots", tmp_path / "discarded")
+    assert {path.name for path in (tmp_path / "snapshots").iterdir()} == left
+    assert [path.name for path in (tmp_path / "discarded").iterdir()] == ["aa.10"]
+    discard_snapshots(tmp_path / "none", tmp_path / "nothing")

@@ -1,0 +1,121 @@
+"""Models on disk: numbered folders, largest model first, that new models replace. What is not ours stays.
+
+A record in the folder of the models says which of them were written here, by their content: people and COLMAP's tools
+write models in the same place, or change those that are there.
+"""
+
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import pycolmap
+
+from hm_sfm.colmap.models import ENDINGS, OPTIONAL, REQUIRED
+from hm_sfm.io.atomic import write_json
+
+logger = logging.getLogger(__name__)
+
+RECORD = ".models.json"
+MODEL_FILES = tuple(f"{part}{ending}" for part in (*REQUIRED, *OPTIONAL) for ending in ENDINGS)
+REPLACED = "replaced"
+
+
+def replace_models(models: Sequence[pycolmap.Reconstruction], sparse_folder: Path, work_folder: Path) -> None:
+    """Write models to sparse_folder/0, 1, ..., where they take the places of those that were written here before.
+
+    Without models, the earlier ones stay. A model that somebody else wrote, or changed, moves aside to <number>_kept,
+    which is logged as a warning. Nothing else is touched, files within the folders of models neither. work_folder: a
+    folder on the same disk; if the process is killed, restore_models brings back what is in it.
+    """
+    written = _read_record(sparse_folder)
+    if not models:
+        if sparse_folder.is_dir() and written:
+            _write_record(sparse_folder, written, latest=0)
+        return
+    finished, replaced = work_folder / "finished", work_folder / REPLACED
+    replaced.mkdir()
+    for number, model in enumerate(models):
+        (finished / str(number)).mkdir(parents=True)
+        model.write_binary(finished / str(number))
+    digests = [digest_model(finished / str(number)) for number in range(len(models))]
+    sparse_folder.mkdir(exist_ok=True)
+    # Known before they are there: whenever the process is killed, what was written here is known as such.
+    _write_record(sparse_folder, [*written, *digests], latest=0)
+    for number in range(len(models)):
+        folder = sparse_folder / str(number)
+        if folder.exists():
+            if folder.is_dir() and (not _list_files(folder) or digest_model(folder) in written):
+                os.replace(folder, replaced / str(number))
+            else:
+                kept = _find_free(sparse_folder, number)
+                os.replace(folder, kept)
+                logger.warning("%s was written or changed by something else: it is now %s", folder, kept)
+        os.replace(finished / str(number), folder)
+    restore_models(sparse_folder, work_folder)
+    for folder in list(sparse_folder.glob("[0-9]*/")):
+        if folder.name.isdecimal() and int(folder.name) >= len(models) and digest_model(folder) in written:
+            for file in _list_files(folder):
+                file.unlink()
+            if not any(folder.iterdir()):
+                folder.rmdir()
+    _write_record(sparse_folder, digests, latest=len(models))
+
+
+def restore_models(sparse_folder: Path, work_folder: Path) -> None:
+    """Bring back what replace_models moved away: files beside those of a model, and models that nothing replaced."""
+    for folder in (work_folder / REPLACED).glob("*/"):
+        sparse_folder.mkdir(exist_ok=True)
+        target = sparse_folder / folder.name
+        if not target.exists():
+            os.replace(folder, target)
+            continue
+        for entry in folder.iterdir():
+            if entry.name not in MODEL_FILES and not (target / entry.name).exists():
+                os.replace(entry, target / entry.name)
+
+
+def count_latest(sparse_folder: Path) -> int:
+    """How many models the latest call of replace_models wrote to a folder; those that were changed do not count."""
+    try:
+        latest = int(json.loads((sparse_folder / RECORD).read_text())["latest"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0
+    written = _read_record(sparse_folder)
+    return sum(digest_model(sparse_folder / str(number)) in written for number in range(latest))
+
+
+def digest_model(folder: Path) -> str:
+    """A digest of the files of a model."""
+    digest = hashlib.sha256()
+    for path in _list_files(folder):
+        with open(path, "rb") as file:
+            digest.update(f"{path.name} {hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode())
+    return digest.hexdigest()
+
+
+def _list_files(folder: Path) -> list[Path]:
+    return [folder / name for name in MODEL_FILES if (folder / name).is_file()]
+
+
+def _find_free(sparse_folder: Path, number: int) -> Path:
+    """<number>_kept, or <number>_kept_2 and so on."""
+    kept, attempt = sparse_folder / f"{number}_kept", 1
+    while kept.exists():
+        attempt += 1
+        kept = sparse_folder / f"{number}_kept_{attempt}"
+    return kept
+
+
+def _read_record(sparse_folder: Path) -> list[str]:
+    """Digests of the models that were written here."""
+    try:
+        return [str(digest) for digest in json.loads((sparse_folder / RECORD).read_text())["written"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+
+
+def _write_record(sparse_folder: Path, digests: Sequence[str], latest: int) -> None:
+    write_json(sparse_folder / RECORD, {"written": list(digests), "latest": latest})

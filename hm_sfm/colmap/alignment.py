@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -67,7 +68,8 @@ def find_similarity(poses: dict[str, pycolmap.Rigid3d], others: dict[str, pycolm
         for xyz, extent, of in zip(centres, extents, (here, there))
     ]
     options = pycolmap.RANSACOptions(max_error=float(MAX_ERROR * extents[1]), random_seed=0)
-    estimate = pycolmap.estimate_sim3d_robust(*marks, options)
+    # A dictionary, whatever its type says.
+    estimate: Any = pycolmap.estimate_sim3d_robust(marks[0], marks[1], options)
     if estimate is None or estimate["num_inliers"] < len(marks[0]) / 2:
         return None
     similarity = estimate["tgt_from_src"]

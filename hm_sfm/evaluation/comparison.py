@@ -99,7 +99,7 @@ def compare(
     digests = {image.name: digest_image(image) for image in collection.images}
     task = ComparisonTask(collection, out, config, digests, cameras, quiet)
     imported = [import_hloc(task, *hloc)] if hloc else []
-    claim_folder(out)
+    claim_folder(out, photos=Path(image_folder))
     write_pairs(out / "pairs.txt", collection.pairs)
     methods: list[Method] = []
     for name, (matcher, made_by) in matchers.items():

@@ -76,7 +76,8 @@ def choose_pairs(
     image_of = {image.name: image for image in images}
 
     def rank_by_appearance(names: Sequence[str], top: int, gap: int) -> np.ndarray:
-        claim_folder(Path(out), shared)
+        first = images[0]
+        claim_folder(Path(out), shared, photos=first.path.parents[len(Path(first.name).parts) - 1])
         encode = get_matcher().encoder.encode_plain
         photos = [image_of[name] for name in names]
         digests = {image.name: digest_image(image) for image in photos}

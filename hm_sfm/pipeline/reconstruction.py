@@ -41,7 +41,7 @@ def match_photos(image_folder: Path, out: Path, config: Config, quiet: bool = Fa
     out, timings = Path(out), Timings()
     get_matcher = cache(partial(load_matcher, config))
     collection = collect_photos(image_folder, out, config, get_matcher, quiet, shared=shard is not None)
-    claim_folder(out, shared=shard is not None)
+    claim_folder(out, shard is not None, Path(image_folder))
     if shard:
         shard.lock(out)
     else:
@@ -66,7 +66,7 @@ def merge_matches(image_folder: Path, out: Path, config: Config) -> int:
     out = Path(out)
     images = list_images(image_folder).images
     pairs = read_pairs(out / "pairs.txt", [image.name for image in images])
-    claim_folder(out)
+    claim_folder(out, photos=Path(image_folder))
     merge_shards(open_store(out / MATCHES_FILE, images, config), pairs, out)
     return len(pairs)
 

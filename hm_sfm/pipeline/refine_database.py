@@ -71,7 +71,7 @@ def refine_database(
     content = read_database(database, Path(image_folder))
     masks = read_masks(content.images, config.masks)
     collection = Collection(Path(image_folder), content.images, tuple(sorted(content.matches)), content.cameras, masks)
-    claim_folder(out)
+    claim_folder(out, photos=Path(image_folder))
     write_point_pairs(out / VERIFIED_FILE, content)
     matching = dataclasses.replace(config.matching, coarse_matches=str(out / VERIFIED_FILE))
     config = dataclasses.replace(config, matching=matching)

@@ -10,6 +10,7 @@ from hm_sfm.errors import MissingPackageError
 from hm_sfm.evaluation.compared_methods import AUC_SHOWN_DEG, MethodResult
 from hm_sfm.evaluation.comparison import Comparison
 from hm_sfm.io.atomic import replace_file, write_json
+from hm_sfm.io.pictures import DRAWN_BY_US
 
 STAGES = ("match", "keypoints", "verify", "map")
 LINE_STYLES = ("-", "--", ":", "-.")
@@ -98,7 +99,7 @@ def plot_tracks(path: Path, comparison: Comparison) -> None:
         axes.grid(alpha=0.3)
     figure.legend(loc="outside right upper", fontsize="small")
     with replace_file(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=120)
+        figure.savefig(temporary, format="png", dpi=120, pil_kwargs={"exif": DRAWN_BY_US})
 
 
 def lay_out_histogram(histogram: dict[int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ import numpy as np
 from hm_sfm.evaluation.relative_poses import PosePair
 from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.io.atomic import replace_file
-from hm_sfm.io.pictures import encode_picture
+from hm_sfm.io.pictures import encode_drawing
 from hm_sfm.photos.images import prepare_image, read_ref
 from hm_sfm.report.drawn_matches import draw_matches, draw_photo_matches
 from hm_sfm.types import PatchMatches
@@ -49,7 +49,7 @@ class MatchPictures:
 
     def _write(self, name: str, picture: np.ndarray) -> None:
         with replace_file(self.folder / f"{self.count:04d}_{name}.png") as temporary:
-            temporary.write_bytes(encode_picture(picture, ".png"))
+            temporary.write_bytes(encode_drawing(picture, ".png"))
         self.count += 1
 
 

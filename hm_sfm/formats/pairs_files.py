@@ -21,11 +21,11 @@ def read_pairs(path: Path, names: Sequence[str]) -> tuple[ImagePair, ...]:
     """Read a pairs file, in the order of its lines: one pair a line, the two names separated by a space or a tab.
 
     A name with spaces stands in double quotes (a quote inside is doubled), or a single tab separates the names. Blank
-    lines and lines that start with # are ignored.
+    lines and lines that start with # are ignored. A pair that stands there again, in either order, counts once: hloc's
+    pairs_from_retrieval writes both "a b" and "b a".
 
     Raises InputError, naming file and line, where the file cannot be read, a line does not hold two names, an image
-    is unknown (all unknown ones are listed), paired with itself, or a pair is repeated in either order; and where
-    there is no pair at all.
+    is unknown (all unknown ones are listed) or paired with itself; and where there is no pair at all.
     """
     path = Path(path)
     try:
@@ -37,7 +37,7 @@ def read_pairs(path: Path, names: Sequence[str]) -> tuple[ImagePair, ...]:
 
     known = set(names)
     unknown: dict[str, int] = {}
-    line_of_pair: dict[ImagePair, int] = {}
+    pairs: dict[ImagePair, None] = {}
     # Not splitlines(), which also splits at characters that may stand in names.
     for number, line in enumerate(text.split("\n"), start=1):
         line = line.removesuffix("\r")
@@ -50,17 +50,14 @@ def read_pairs(path: Path, names: Sequence[str]) -> tuple[ImagePair, ...]:
                 unknown.setdefault(name, number)
         if name_a == name_b:
             raise InputError(f"{where}: {name_a!r} is paired with itself")
-        pair = ImagePair.of(name_a, name_b)
-        if pair in line_of_pair:
-            raise InputError(f"{where}: repeats the pair of line {line_of_pair[pair]}, {name_a!r} and {name_b!r}")
-        line_of_pair[pair] = number
+        pairs.setdefault(ImagePair.of(name_a, name_b))
     if unknown:
         listed = [f"{name!r} (line {number})" for name, number in unknown.items()]
         rest = f" and {len(listed) - MAX_NAMES_LISTED} more" if len(listed) > MAX_NAMES_LISTED else ""
         raise InputError(f"{path} names images that are not there: {', '.join(listed[:MAX_NAMES_LISTED])}{rest}")
-    if not line_of_pair:
+    if not pairs:
         raise InputError(f"the pairs file {path} holds no pair")
-    return tuple(line_of_pair)
+    return tuple(pairs)
 
 
 def write_pairs(path: Path, pairs: Iterable[ImagePair]) -> None:

@@ -15,6 +15,7 @@ from hm_sfm.network.estimates import estimate_patches
 from hm_sfm.network.fine import FineMap
 from hm_sfm.photos.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
 from hm_sfm.photos.images import prepare_image
+from hm_sfm.photos.sizes import find_scale
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
 ITERATIONS = 1
@@ -114,8 +115,8 @@ class PatchRefiner:
 
 
 def size_at(image: ImageRef, long_edge_px: int) -> tuple[float, float]:
-    """(w, h) of a photo whose longer side is reduced to long_edge_px."""
-    scale = min(1.0, long_edge_px / max(image.size_wh))
+    """(w, h) of a photo that is reduced to long_edge_px, see find_scale."""
+    scale = find_scale(image.size_wh, long_edge_px)
     return image.size_wh[0] * scale, image.size_wh[1] * scale
 
 

@@ -24,6 +24,7 @@ from hm_sfm.matching.encoder import Encoder
 from hm_sfm.matching.order import order_pairs
 from hm_sfm.matching.store import MatchStore
 from hm_sfm.network.fine import HomographyHead
+from hm_sfm.photos.sizes import measure_px_scale
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
 REFINED_FILE = "refined.h5"
@@ -114,7 +115,7 @@ class KeypointRefiner:
 
 def rescale_photo(photo: Photo, image: ImageRef, long_edge_px: int) -> Photo:
     """The same photo in px of its size at `long_edge_px`, or at the matching resolution where that is larger."""
-    px_scale = min(photo.px_scale, max(1.0, max(image.size_wh) / long_edge_px))
+    px_scale = min(photo.px_scale, measure_px_scale(image.size_wh, long_edge_px))
     return replace(photo, px_scale=px_scale, matching_scale=photo.px_scale / px_scale)
 
 

@@ -16,6 +16,7 @@ import pycolmap
 
 from hm_sfm.errors import ConfigError, InputError, MissingPackageError
 from hm_sfm.geometry.frames import flip_matrix, homography_to_pixel_index, rotation_matrix
+from hm_sfm.io.pictures import is_drawing
 from hm_sfm.photos.bitmaps import (
     INSTALL_HEIC,
     JPEG_MAGIC,
@@ -29,6 +30,7 @@ from hm_sfm.photos.bitmaps import (
 )
 from hm_sfm.photos.folders import find_files
 from hm_sfm.photos.orientation import MIRRORED_IN_EXIF, ROTATION_FROM_EXIF, show_upright
+from hm_sfm.photos.sizes import MIN_EDGE_PX, check_size, find_scale
 from hm_sfm.types import ImageRef, Position, freeze_array
 
 logger = logging.getLogger(__name__)
@@ -39,8 +41,6 @@ HEIC_EXTENSIONS = (".heic", ".heif", ".hif")
 RAW_EXTENSIONS = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw")
 UNREADABLE_EXTENSIONS = (*RAW_EXTENSIONS, ".jxl", ".psd", ".exr", ".hdr")
 """Of photos that no library here reads."""
-MIN_EDGE_PX = 32
-"""The network's coarse cells are 8 px: below this there is nothing to match."""
 
 # ANYDEPTH keeps 16 bits. The conversion to grey drops alpha: COLMAP ignores it too, and compositing would draw
 # edges against an invented background.
@@ -104,6 +104,8 @@ def list_images(folder: Path) -> ImageList:
         logger.warning("skipped: %s (%d such files)", skipped[0][1], len(heic))
     for name in candidates:
         try:
+            if is_drawing(folder / name):
+                raise InputError(f"{folder / name} is a picture that hm_sfm drew, not a photo")
             images.append(read_run_ref(folder / name, name))
         except (InputError, MissingPackageError) as error:
             logger.warning("skipped: %s", error)
@@ -137,7 +139,7 @@ def read_ref(path: Path, name: str | None = None) -> ImageRef:
     if not _is_complete(data):
         raise InputError(f"{path} is cut short or cannot be decoded")
     size_wh = (bitmap.width, bitmap.height)
-    _check_size(size_wh, str(path))
+    check_size(size_wh, str(path))
     orientation = bitmap.exif_orientation() or 1
     rotation_deg, mirrored = ROTATION_FROM_EXIF.get(orientation, 0), orientation in MIRRORED_IN_EXIF
     if data.startswith(JPEG_MAGIC) and (damage := _find_damage(data)):
@@ -162,7 +164,7 @@ def _read_gps(bitmap: pycolmap.Bitmap) -> Position | None:
 
 
 def prepare_image(ref: ImageRef, long_edge_px: int) -> PreparedImage:
-    """Read a photo's pixels, turn them upright and reduce them so that the long edge is at most `long_edge_px`.
+    """Read a photo's pixels, show them upright and reduce them to `long_edge_px`, see find_scale.
 
     Colour becomes grey, the 16 bits of a PNG or TIFF are kept, alpha is dropped. Never enlarged, never padded.
 
@@ -202,7 +204,7 @@ def prepare_array(array: np.ndarray, long_edge_px: int, name: str = "array") -> 
     if array.dtype != np.uint8 or not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)):
         raise InputError(f"{name} must be an (H, W) or (H, W, 3) uint8 array, got {array.shape} {array.dtype}")
     size_wh = (array.shape[1], array.shape[0])
-    _check_size(size_wh, name)
+    check_size(size_wh, name)
     array = np.ascontiguousarray(array)
     grey = array if array.ndim == 2 else cv2.cvtColor(array, cv2.COLOR_RGB2GRAY)
     return _prepare(ImageRef(name, Path(name), size_wh), grey, long_edge_px)
@@ -235,7 +237,7 @@ def _prepare(ref: ImageRef, stored: np.ndarray, long_edge_px: int) -> PreparedIm
     """Reduce and turn a stored grey image, (H, W) uint8 or uint16."""
     if long_edge_px < MIN_EDGE_PX:
         raise ConfigError(f"images.long_edge_px must be at least {MIN_EDGE_PX}, found {long_edge_px}")
-    scale = min(1.0, long_edge_px / max(ref.size_wh))
+    scale = find_scale(ref.size_wh, long_edge_px)
     width, height = ref.size_wh
     reduced_wh = (max(1, round(width * scale)), max(1, round(height * scale)))
     reduced = stored if scale == 1.0 else cv2.resize(stored, reduced_wh, interpolation=cv2.INTER_AREA)
@@ -289,11 +291,6 @@ def _has_jpeg_end(data: bytes) -> bool:
         is_padding = marker == 0xFF
         at += 1 if is_padding else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return False
-
-
-def _check_size(size_wh: tuple[int, int], what: str) -> None:
-    if min(size_wh) < MIN_EDGE_PX:
-        raise InputError(f"{what} is {size_wh[0]} x {size_wh[1]} px, at least {MIN_EDGE_PX} px a side are needed")
 
 
 def _is_storable(name: str) -> bool:

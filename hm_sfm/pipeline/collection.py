@@ -19,6 +19,7 @@ from hm_sfm.pairs.retrieval import CellStore, describe_images, find_similar
 from hm_sfm.pairs.selection import select_pairs
 from hm_sfm.photos.images import list_images
 from hm_sfm.photos.masks import NO_MASKS, Masks, read_masks
+from hm_sfm.photos.sizes import measure_px_scale
 from hm_sfm.pipeline.output_folder import claim_folder
 from hm_sfm.types import ImagePair, ImageRef
 
@@ -97,4 +98,4 @@ def choose_pairs(
 
 def measure_px_scales(images: Sequence[ImageRef], config: Config) -> dict[str, float]:
     """Image name -> px of the stored image per px at the matching resolution."""
-    return {image.name: max(1.0, max(image.size_wh) / config.images.long_edge_px) for image in images}
+    return {image.name: measure_px_scale(image.size_wh, config.images.long_edge_px) for image in images}

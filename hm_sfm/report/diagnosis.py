@@ -12,6 +12,7 @@ from hm_sfm.colmap.cameras import Cameras
 from hm_sfm.colmap.database import open_database, read_verified_matches
 from hm_sfm.colmap.overlays import STILL_PX, measure_moves
 from hm_sfm.config import Config
+from hm_sfm.photos.sizes import measure_px_scale
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
 MOST_LISTED = 4
@@ -119,7 +120,7 @@ class Evidence:
         Photos from one place do that, and also those of an object that turns before a camera that does not move.
         """
         checks, long_edge_px = self.config.verification, self.config.images.long_edge_px
-        px_scale = {image.name: max(1.0, max(image.size_wh) / long_edge_px) for image in self.images.values()}
+        px_scale = {image.name: measure_px_scale(image.size_wh, long_edge_px) for image in self.images.values()}
         still = []
         for pair in self.pairs:
             if name in (pair.name0, pair.name1):

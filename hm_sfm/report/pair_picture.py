@@ -12,9 +12,10 @@ from hm_sfm.config import CameraConfig, VerificationConfig
 from hm_sfm.errors import InputError
 from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.io.atomic import replace_file
-from hm_sfm.io.pictures import encode_picture
+from hm_sfm.io.pictures import encode_drawing
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.photos.images import PreparedImage, prepare_image, read_ref
+from hm_sfm.photos.sizes import measure_px_scale
 from hm_sfm.report.drawn_matches import GAP_PX, WORST_PX, draw_photo_matches, make_grey, place_points
 from hm_sfm.types import PatchMatches
 
@@ -49,7 +50,7 @@ def check_picture_path(path: Path) -> None:
 def write_picture(path: Path, picture: np.ndarray) -> None:
     """Write (H, W, 3) uint8 BGR, atomically; the format goes by the file's ending."""
     with replace_file(path) as temporary:
-        temporary.write_bytes(encode_picture(picture, Path(path).suffix.lower()))
+        temporary.write_bytes(encode_drawing(picture, Path(path).suffix.lower()))
 
 
 def draw_pair(matcher: HomoMatcher, path_a: Path, path_b: Path, checks: VerificationConfig) -> PairPicture:
@@ -65,7 +66,7 @@ def draw_pair(matcher: HomoMatcher, path_a: Path, path_b: Path, checks: Verifica
     good = matches.select(matches.score >= checks.min_score)
     # One by one: photos of two folders may have the same name.
     camera_a, camera_b = (make_cameras([ref], CameraConfig()).cameras[0] for ref in refs)
-    scale_a, scale_b = (max(1.0, max(ref.size_wh) / matcher.images.long_edge_px) for ref in refs)
+    scale_a, scale_b = (measure_px_scale(ref.size_wh, matcher.images.long_edge_px) for ref in refs)
     agreeing = verify_pair(good, camera_a, camera_b, checks, (scale_a, scale_b))
     count = int(np.count_nonzero(agreeing))
     is_verified = is_convincing(count, len(good), checks)

@@ -7,6 +7,7 @@ import numpy as np
 
 from hm_sfm.errors import MissingPackageError
 from hm_sfm.io.atomic import replace_file
+from hm_sfm.io.pictures import DRAWN_BY_US
 
 SMOOTHED_SHARE = 0.02
 """Of the steps that each point of a loss curve is the mean of."""
@@ -55,7 +56,7 @@ def draw_curves(log: Path, validation: Path, path: Path) -> None:
     for panel in axes[2 + len(panels) :]:
         panel.remove()
     with replace_file(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=100)
+        figure.savefig(temporary, format="png", dpi=100, pil_kwargs={"exif": DRAWN_BY_US})
 
 
 def read_columns(path: Path) -> dict[str, np.ndarray]:

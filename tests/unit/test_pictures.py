@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import hm_sfm
-from hm_sfm.io.pictures import encode_picture
+from hm_sfm.io.pictures import encode_drawing, encode_picture, is_drawing
+from hm_sfm.photos.images import list_images
+from hm_sfm.report.pair_picture import write_picture
 
 ENCODE_AFTER = """
 import importlib, os, sys
@@ -38,6 +40,23 @@ def test_a_picture_is_blue_green_red(ending):
         grey = picture[:, :, 0]
         code = np.frombuffer(encode_picture(grey, ending), np.uint8)
         np.testing.assert_array_equal(cv2.imdecode(code, cv2.IMREAD_UNCHANGED), grey)
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".jpeg", ".webp"])
+def test_drawings_are_known_as_such_and_are_no_photos(tmp_path, ending, caplog):
+    picture = np.zeros((32, 48, 3), np.uint8)
+    picture[:, :16], picture[:, 16:32], picture[:, 32:] = (250, 20, 10), (10, 240, 20), (30, 20, 245)
+    decoded = cv2.imdecode(np.frombuffer(encode_drawing(picture, ending), np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_allclose(decoded[:, 4:12], picture[:, 4:12], atol=0 if ending == ".png" else 40)
+    write_picture(tmp_path / f"drawn{ending}", picture)
+    (tmp_path / f"photo{ending}").write_bytes(encode_picture(picture, ending))
+    assert [is_drawing(path) for path in sorted(tmp_path.iterdir())] == [True, False]
+    listing = list_images(tmp_path)
+    assert [image.name for image in listing.images] == [f"photo{ending}"]
+    assert listing.skipped == (
+        (f"drawn{ending}", f"{tmp_path / f'drawn{ending}'} is a picture that hm_sfm drew, not a photo"),
+    )
+    assert caplog.messages == [f"skipped: {listing.skipped[0][1]}"]
 
 
 @pytest.mark.slow

@@ -37,6 +37,8 @@ VOCABULARY_CELLS = 20_000
 """Cells of all photos together that the vocabulary is learned from."""
 CELLS_PER_WORD = 20
 """Fewer cells make fewer words."""
+NEAR_DUPLICATE = 0.9
+"""Least similarity of photos of one burst. Neighbours on a walk around a building have 0.85 at most."""
 BLOCK_ROWS = 512
 """Rows of the similarity matrix that are held at a time."""
 
@@ -188,6 +190,9 @@ def weigh_words(counts: np.ndarray) -> np.ndarray:
 def find_similar(descriptors: np.ndarray, top: int, gap: int = 0) -> np.ndarray:
     """For each descriptor the `top` most similar others that are more than `gap` rows away, best first.
 
+    Near-duplicates, as bursts of photos are, do not fill the list: only a quarter of it is of each group of them, as
+    long as there are others. Without that, a burst of more than `top` photos would have no pair with anything else.
+
     descriptors: (N, D) float32, none of it negative, or (T, N, D): each photo as it is, the first of T ways, is then
     compared with the others in all ways, of which the most similar one counts. Returns (N, top) int64 rows, -1 where no
     more have anything in common with it. Of equally similar ones the lower row comes first.
@@ -195,6 +200,7 @@ def find_similar(descriptors: np.ndarray, top: int, gap: int = 0) -> np.ndarray:
     rotated = descriptors[1:] if descriptors.ndim == 3 else []
     descriptors = descriptors[0] if descriptors.ndim == 3 else descriptors
     count = len(descriptors)
+    group = group_near_duplicates(descriptors)
     similar = np.full((count, top), -1, np.int64)
     for start in range(0, count, BLOCK_ROWS):
         block = descriptors[start : start + BLOCK_ROWS]
@@ -203,7 +209,41 @@ def find_similar(descriptors: np.ndarray, top: int, gap: int = 0) -> np.ndarray:
             np.maximum(similarity, block @ others.T, out=similarity)
         rows = np.arange(start, start + len(similarity))
         similarity[np.abs(rows[:, None] - np.arange(count)) <= gap] = 0
-        best = np.argsort(-similarity, axis=1, kind="stable")[:, :top]
-        is_similar = np.take_along_axis(similarity, best, axis=1) > 0
-        similar[rows, : best.shape[1]] = np.where(is_similar, best, -1)
+        order = np.argsort(-similarity, axis=1, kind="stable")
+        for row, ranked, num_similar in zip(rows, order, np.count_nonzero(similarity > 0, axis=1)):
+            best = choose_from_groups(ranked[:num_similar], group, top)
+            similar[row, : len(best)] = best
     return similar
+
+
+def group_near_duplicates(descriptors: np.ndarray) -> np.ndarray:
+    """(N,) int64: for each photo (N, D) the row of the earliest one that it nearly equals and that leads a group.
+
+    A photo that nearly equals none leads a group of its own.
+    """
+    group = np.arange(len(descriptors))
+    leaders = np.zeros(0, np.int64)
+    for start in range(0, len(descriptors), BLOCK_ROWS):
+        block = descriptors[start : start + BLOCK_ROWS]
+        rows = np.arange(start, start + len(block))
+        similarity = block @ descriptors[np.concatenate([leaders, rows])].T
+        leads = np.concatenate([np.ones(len(leaders), bool), np.zeros(len(block), bool)])
+        candidates = np.concatenate([leaders, rows])
+        for number, row in enumerate(rows):
+            equal = np.flatnonzero(leads & (similarity[number] >= NEAR_DUPLICATE))
+            if len(equal):
+                group[row] = candidates[equal[0]]
+            else:
+                leads[len(leaders) + number] = True
+        leaders = candidates[leads]
+    return group
+
+
+def choose_from_groups(ranked: np.ndarray, group: np.ndarray, top: int) -> np.ndarray:
+    """The first `top` of the rows `ranked`, of each group at most a quarter of them while there are others."""
+    most = max(1, top // 4)
+    of_group = group[ranked]
+    order = np.argsort(of_group, kind="stable")
+    place = np.empty(len(ranked), np.int64)  # of a row among those of its group
+    place[order] = np.arange(len(ranked)) - np.searchsorted(of_group[order], of_group[order])
+    return ranked[np.argsort(place >= most, kind="stable")][:top]

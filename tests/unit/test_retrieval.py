@@ -19,6 +19,7 @@ from hm_sfm.pairs.retrieval import (
     count_words,
     describe_images,
     find_similar,
+    group_near_duplicates,
     learn_vocabulary,
     sample_cells,
     weigh_words,
@@ -247,7 +248,7 @@ def test_photos_with_nothing_in_common_are_in_no_pair():
 
 
 def test_the_most_similar_come_first_whatever_the_block(monkeypatch):
-    descriptors = normalise(np.random.default_rng(1).uniform(size=(41, 8)))
+    descriptors = normalise(np.random.default_rng(1).uniform(size=(41, 20)) ** 4)
     similarity = descriptors.astype(np.float64) @ descriptors.T
     np.fill_diagonal(similarity, -2)
     expected = np.argsort(-similarity, axis=1)[:, :5]
@@ -267,6 +268,38 @@ def test_a_gap_leaves_the_neighbours_out():
     descriptors = np.tile(np.array([[1, 0]], np.float32), (6, 1))
     assert find_similar(descriptors, 6, 2).tolist()[0] == [3, 4, 5, -1, -1, -1]
     assert find_similar(descriptors, 2, 2).tolist()[3] == [0, -1]
+
+
+def make_bursts(places: int, count: int, seed: int = 0) -> np.ndarray:
+    """Descriptors (N, D) of unit length of `count` nearly equal photos of each place; neighbours have 0.3 in common."""
+    rng = np.random.default_rng(seed)
+    place = np.abs(rng.normal(size=(places, 400))) * (rng.random((places, 400)) < 0.15)
+    photos = np.repeat(place, count, axis=0)
+    return normalise(photos + 0.05 * np.abs(rng.normal(size=photos.shape)))
+
+
+def test_bursts_are_paired_with_each_other(monkeypatch):
+    monkeypatch.setattr(retrieval, "BLOCK_ROWS", 16)
+    order = np.random.default_rng(1).permutation(66)
+    descriptors, burst = make_bursts(3, 22)[order], np.repeat(np.arange(3), 22)[order]
+    assert len(np.unique(group_near_duplicates(descriptors))) == 3
+    similar = find_similar(descriptors, 20)
+    assert all(np.bincount(burst[row], minlength=3).tolist() == [10 if k == burst[i] else 5 for k in range(3)]
+               for i, row in enumerate(similar))  # fmt: skip
+    assert (burst[similar[:, :5]] == burst[:, None]).all()
+    names = [f"{i:02d}.jpg" for i in range(66)]
+    pairs = select_pairs(names, PairConfig(), lambda names, top, gap: find_similar(descriptors, top, gap))
+    joined = {(burst[names.index(pair.name0)], burst[names.index(pair.name1)]) for pair in pairs}
+    assert {tuple(sorted(places)) for places in joined} == {(a, b) for a in range(3) for b in range(a, 3)}
+
+
+def test_a_burst_alone_fills_the_list():
+    descriptors = make_bursts(1, 12)
+    similar = find_similar(descriptors, 8)
+    similarity = descriptors @ descriptors.T
+    np.fill_diagonal(similarity, 0)
+    np.testing.assert_array_equal(similar, np.argsort(-similarity, axis=1, kind="stable")[:, :8])
+    assert (find_similar(descriptors, 8, 9)[0] >= 0).sum() == 2
 
 
 def test_a_thousand_photos_need_few_pairs(monkeypatch, tmp_path):

@@ -1,8 +1,9 @@
-"""Other first guesses of the cameras, for matches that the first ones lead to no model or to a wrong one.
+"""Other first guesses of the cameras, where matches contradict the first ones or these lead to no good model.
 
-They are written into copies of a verified database.
+They are written into a verified database.
 """
 
+import logging
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,8 +16,12 @@ import pycolmap
 from hm_sfm.colmap.cameras import FOCAL_RATIOS, guess_focal_px
 from hm_sfm.colmap.database import copy_database, open_database
 
+logger = logging.getLogger(__name__)
+
 WIDER, LONGER = 0.6, 1.8
 """Guesses of focal lengths beside the first one, relative to it."""
+MOST_LISTED = 3
+"""Focal lengths that a warning names."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +105,33 @@ def split_cameras(path: Path) -> None:
             row = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
             database.update_image(row)
         pycolmap.apply_rig_config([], database)
+
+
+def correct_focal_lengths(path: Path) -> None:
+    """Replace the known focal lengths that most pairs contradict by estimates from the pairs, with a warning.
+
+    Raises InputError where there is no database.
+    """
+    doubtful = find_doubtful(path)
+    if not doubtful:
+        return
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".estimates.") as folder:
+        copy = copy_database(path, Path(folder) / "copy.db")
+        estimate_focal_lengths(copy)
+        with open_database(copy) as database:
+            estimates = {camera.camera_id: camera for camera in database.read_all_cameras()}
+    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
+        changes = []
+        for camera_id in doubtful:
+            given_px = database.read_camera(camera_id).mean_focal_length()
+            changes.append(f"{given_px:.0f} px by {estimates[camera_id].mean_focal_length():.0f} px")
+            database.update_camera(estimates[camera_id])
+    more = f" and {len(changes) - MOST_LISTED} more" if len(changes) > MOST_LISTED else ""
+    logger.warning(
+        "the focal length in EXIF contradicts the matches (cropped photos?): estimates from the pairs replace it, %s%s",
+        ", ".join(changes[:MOST_LISTED]),
+        more,
+    )
 
 
 def find_doubtful(path: Path) -> tuple[int, ...]:

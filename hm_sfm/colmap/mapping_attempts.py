@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from hm_sfm.colmap.camera_starts import CameraStart, find_doubtful, list_starts
+from hm_sfm.colmap.camera_starts import MOST_LISTED, CameraStart, list_starts
 from hm_sfm.colmap.database import copy_database, open_database, replace_database
 from hm_sfm.colmap.mapping_task import Build, MappingTask
 from hm_sfm.colmap.model_judgement import ENOUGH_AGREEMENT, Judgement, find_undetermined, is_impossible, judge_model
@@ -73,12 +73,8 @@ def find_models(
 
 
 def _try_starts(task: MappingTask, build: Build, work_folder: Path) -> Attempt:
-    doubtful = find_doubtful(task.database)
-    starts: list[CameraStart | None] = [None, *list_starts(task.database, task.split_cameras)]
-    if doubtful:
-        starts = [*starts[1:2], None, *starts[2:]]
     best = None
-    for number, start in enumerate(starts):
+    for number, start in enumerate((None, *list_starts(task.database, task.split_cameras))):
         attempt = _attempt(task, start, build, work_folder / str(number))
         gain = 1.0 if attempt.is_good else CLEAR_GAIN
         if best is None or attempt.explained > gain * best.explained:
@@ -87,7 +83,7 @@ def _try_starts(task: MappingTask, build: Build, work_folder: Path) -> Attempt:
             break
     assert best is not None  # there is a start at least
     if best.start and best.explained:
-        _warn_of_start(task.database, best, doubtful)
+        _warn_of_start(task.database, best)
     if best.judgement and best.judgement.agreement < ENOUGH_AGREEMENT and not best.judgement.impossible:
         logger.warning(
             "%d %% of the verified matches contradict the model of %d photos: it may be wrong; try --camera-mode "
@@ -166,23 +162,24 @@ def _drop_impossible(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap
     return kept
 
 
-def _warn_of_start(path: Path, attempt: Attempt, doubtful: Sequence[int]) -> None:
+def _warn_of_start(path: Path, attempt: Attempt) -> None:
     """Say what was changed about the cameras of a database."""
     assert attempt.start
     with open_database(path) as database:
-        exif_px = {
-            camera.camera_id: camera.mean_focal_length()
-            for camera in database.read_all_cameras()
-            if camera.has_prior_focal_length
-        }
-    reason = "the first guess led to no good model"
-    if exif_px:
-        given = ", ".join(sorted({f"{focal_px:.0f} px" for focal_px in exif_px.values()})[:3])
-        seen = "contradicts the matches" if set(exif_px) & set(doubtful) else "led to no good model"
-        reason = f"the focal length in EXIF ({given}) {seen}"
-    cameras = [attempt.models[0].camera(camera_id) for camera_id in sorted(attempt.models[0].cameras)]
-    estimates = ", ".join(sorted({f"{camera.mean_focal_length():.0f} px" for camera in cameras})[:3])
-    logger.warning("%s: the model was built with %s (%s)", reason, attempt.start.name, estimates)
+        given = [camera for camera in database.read_all_cameras() if camera.has_prior_focal_length]
+    first = (
+        f"the focal length in EXIF ({_list_focal_lengths(given)})" if given else "the first guess of the focal length"
+    )
+    cameras = list(attempt.models[0].cameras.values())
+    logger.warning(
+        "%s led to no good model: it was built with %s (%s)", first, attempt.start.name, _list_focal_lengths(cameras)
+    )
+
+
+def _list_focal_lengths(cameras: Sequence[pycolmap.Camera]) -> str:
+    focal_px = sorted({round(camera.mean_focal_length()) for camera in cameras})
+    more = f" and {len(focal_px) - MOST_LISTED} more" if len(focal_px) > MOST_LISTED else ""
+    return ", ".join(f"{value} px" for value in focal_px[:MOST_LISTED]) + more
 
 
 def sort_models(models: list[pycolmap.Reconstruction]) -> None:

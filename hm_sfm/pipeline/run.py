@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 from tqdm import tqdm
 
+from hm_sfm.colmap.camera_starts import correct_focal_lengths
 from hm_sfm.colmap.database import write_database
 from hm_sfm.colmap.mapping import MappingTask, map_images
 from hm_sfm.colmap.overlays import Overlays, find_overlays
@@ -189,9 +190,11 @@ def write_verified(
     keypoints: Sequence[Keypoints],
     matches: Sequence[IndexMatches],
 ) -> None:
-    """A new database, see write_database, with the two-view geometries of all its pairs."""
+    """A new database, see write_database, with the two-view geometries of all its pairs, see correct_focal_lengths."""
     write_database(path, collection.images, collection.cameras, keypoints, matches)
     verify_database(path, config.verification, measure_px_scales(collection.images, config))
+    if not collection.cameras.known:
+        correct_focal_lengths(path)
 
 
 def map_database(

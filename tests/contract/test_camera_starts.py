@@ -11,13 +11,15 @@ import pycolmap
 import pytest
 
 from hm_sfm.colmap import mapping_attempts
-from hm_sfm.colmap.camera_starts import find_doubtful, split_cameras
+from hm_sfm.colmap.camera_starts import correct_focal_lengths, find_doubtful, split_cameras
 from hm_sfm.colmap.cameras import Cameras, guess_focal_px
 from hm_sfm.colmap.database import open_database, write_database
 from hm_sfm.colmap.mapping import MappingTask, map_images, map_incrementally
 from hm_sfm.colmap.model_judgement import find_undetermined, is_impossible, judge_model
 from hm_sfm.colmap.verification import verify_database
-from hm_sfm.config import VerificationConfig
+from hm_sfm.config import Config, VerificationConfig
+from hm_sfm.pipeline import run
+from hm_sfm.pipeline.collection import Collection
 from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 SIZE_WH = (640, 480)
@@ -113,10 +115,12 @@ def write_verified(folder: Path, scene: Scene, camera: pycolmap.Camera) -> tuple
 
 
 def reconstruct(
-    folder: Path, scene: Scene, camera: pycolmap.Camera, split_cameras: bool = True
+    folder: Path, scene: Scene, camera: pycolmap.Camera, split_cameras: bool = True, correct: bool = True
 ) -> tuple[pycolmap.Reconstruction, ...]:
     """The models of photos that share a camera; their database is in the folder, too."""
     path, cameras = write_verified(folder, scene, camera)
+    if correct:
+        correct_focal_lengths(path)
     task = MappingTask(path, folder, folder / "sparse", split_cameras=split_cameras)
     return map_images(task, scene.images, cameras)
 
@@ -153,7 +157,7 @@ def attempts(monkeypatch) -> list[str]:
     return names
 
 
-@pytest.mark.parametrize("factor", [0.25, 0.5, 1.0, 4.0])
+@pytest.mark.parametrize("factor", [0.12, 0.5, 1.0, 4.0])
 def test_a_wrong_focal_length_in_exif_is_corrected(tmp_path, attempts, caplog, factor):
     scene = make_street()
     (model,) = reconstruct(tmp_path, scene, make_camera(factor * FOCAL_PX, prior=True))
@@ -165,10 +169,34 @@ def test_a_wrong_focal_length_in_exif_is_corrected(tmp_path, attempts, caplog, f
     if factor < 1:
         assert camera.focal_length == pytest.approx(FOCAL_PX, rel=0.05)
         (message,) = caplog.messages
-        assert message.startswith(f"the focal length in EXIF ({factor * FOCAL_PX:.0f} px) contradicts the matches")
+        assert message.startswith("the focal length in EXIF contradicts the matches")
+        assert f"{factor * FOCAL_PX:.0f} px by 5" in message
     else:  # adjustment finds it
         assert caplog.messages == []
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["database.db", "sparse"]
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["given", "exif"])
+def test_runs_correct_exif_but_not_what_the_user_gave(tmp_path, known):
+    scene = make_street()
+    cameras = Cameras((make_camera(0.5 * FOCAL_PX, True),), (0,) * len(scene.images), known=known)
+    collection = Collection(tmp_path, scene.images, tuple(some.pair for some in scene.matches), cameras)
+    run.write_verified(tmp_path / "database.db", collection, Config(), scene.keypoints, scene.matches)
+    (camera,) = read_cameras(tmp_path)
+    assert camera.has_prior_focal_length == known
+    assert camera.focal_length == pytest.approx((0.5 if known else 1.0) * FOCAL_PX, rel=0.05)
+
+
+@pytest.mark.parametrize("factor", [0.12, 9.0])
+def test_models_with_a_wrong_focal_length_in_exif_are_built_again(tmp_path, attempts, caplog, factor):
+    scene = make_street()
+    (model,) = reconstruct(tmp_path, scene, make_camera(factor * FOCAL_PX, prior=True), correct=False)
+    assert measure_worst_rotation(model, scene) < 0.15
+    assert attempts == ["as given", "focal lengths estimated from the pairs"]
+    (message,) = caplog.messages
+    assert message.startswith(
+        f"the focal length in EXIF ({factor * FOCAL_PX:.0f} px) led to no good model: it was built with focal lengths"
+    )
 
 
 @pytest.mark.parametrize(("factor", "doubtful"), [(0.4, (1,)), (0.95, ()), (1.1, ())])
@@ -191,8 +219,8 @@ def test_zoomed_photos_get_cameras_of_their_own(tmp_path, attempts, caplog, prio
     for image in model.images.values():
         zoom = ZOOMS[int(image.name[0])]
         assert model.camera(image.camera_id).focal_length == pytest.approx(FOCAL_PX * zoom, rel=0.01)
-    assert attempts[-1] == "a camera for each photo" and len(attempts) == 3
-    assert "a camera for each photo (1038 px, 519 px, 674 px)" in caplog.text
+    assert attempts == ["as given", "focal lengths estimated from the pairs", "a camera for each photo"]
+    assert "built with a camera for each photo (519 px, 674 px, 830 px and 1 more)" in caplog.text
     # The database has the cameras of the model: COLMAP's own mapper can go on from it.
     stored = {camera.camera_id for camera in read_cameras(tmp_path)}
     assert stored == {image.camera_id for image in model.images.values()} and len(stored) == 6

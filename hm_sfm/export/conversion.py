@@ -9,6 +9,7 @@
 | txt | a folder: the model as COLMAP's text files |
 """
 
+import hashlib
 import json
 import logging
 import os
@@ -34,6 +35,8 @@ from hm_sfm.types import ImagePair, ImageRef, IndexMatches, Keypoints
 
 logger = logging.getLogger(__name__)
 
+MAX_NAME_BYTES = 240
+"""Of a file in one folder. Most file systems allow 255; some are left for the endings of copies that readers make."""
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Cameras of OpenGL look along -z with y up, those of COLMAP along z with y down."""
 
@@ -216,12 +219,18 @@ def undistort_run(
 
 
 def flatten_names(names: Sequence[str]) -> dict[str, str]:
-    """Names without folders that stay different, also where case does not count: a/b.jpg becomes a_b.jpg."""
+    """Names without folders that stay different, also where case does not count: a/b.jpg becomes a_b.jpg.
+
+    What would be longer than a name of a file may be begins with a digest instead of its first folders.
+    """
     flat: dict[str, str] = {}
     taken: set[str] = set()
     # Names without folders come first: they keep theirs.
     for name in sorted(names, key=lambda name: ("/" in name, name)):
         short = name.replace("/", "_")
+        if len(short.encode()) > MAX_NAME_BYTES:
+            digest = hashlib.sha256(name.encode()).hexdigest()[:8]
+            short = f"{digest}_{short.encode()[len(digest) + 1 - MAX_NAME_BYTES :].decode(errors='ignore')}"
         while short.lower() in taken:
             short = f"_{short}"
         taken.add(short.lower())

@@ -380,6 +380,17 @@ def test_flat_names_differ_where_case_does_not_count():
     assert not any("/" in name for name in flat.values())
 
 
+def test_flat_names_are_no_longer_than_names_of_files_may_be(tmp_path):
+    folder, file = "f" * 150, "p" * 116 + ".jpg"
+    names = [f"{folder}/{file}", f"{folder}x/{file}", f"{'ü' * 75}/{'ä' * 75}.jpg"]
+    flat = flatten_names(names)
+    assert len(set(flat.values())) == 3 and max(len(name.encode()) for name in flat.values()) <= 240
+    assert all(flat[name].endswith(f"_{name.split('/')[1]}") for name in names)
+    out = make_run(tmp_path, "SIMPLE_RADIAL", [300.0, 160.0, 120.0, 0.08], tuple(names))
+    convert_run(out, "3dgs", tmp_path / "3dgs")
+    assert list_files(tmp_path / "3dgs" / "images") == set(flat.values())
+
+
 # nerfstudio
 
 

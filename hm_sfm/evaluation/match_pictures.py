@@ -8,6 +8,7 @@ import numpy as np
 from hm_sfm.evaluation.relative_poses import PosePair
 from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.io.atomic import replace_file
+from hm_sfm.io.names import cut_name
 from hm_sfm.io.pictures import encode_drawing
 from hm_sfm.photos.images import prepare_image, read_ref
 from hm_sfm.report.drawn_matches import draw_matches, draw_photo_matches
@@ -45,7 +46,7 @@ class MatchPictures:
         """error_px: (M,) px of stored image 1."""
         photo0, photo1 = (prepare_image(read_ref(path), LONG_EDGE_PX) for path in (path0, path1))
         picture = draw_photo_matches(photo0, photo1, matches.xy0, matches.xy1, error_px)
-        self._write(f"{path0.stem}-{path1.stem}", picture)
+        self._write(f"{cut_name(path0.stem, 100)}-{cut_name(path1.stem, 100)}", picture)
 
     def _write(self, name: str, picture: np.ndarray) -> None:
         with replace_file(self.folder / f"{self.count:04d}_{name}.png") as temporary:

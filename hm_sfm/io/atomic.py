@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hm_sfm.errors import InputError
+from hm_sfm.io.names import cut_name
 
 
 @contextmanager
@@ -46,7 +47,7 @@ def make_folder(target: Path) -> Iterator[Path]:
     if target.exists() and not (target.is_dir() and not any(target.iterdir())):
         raise InputError(f"{target} is there already and not empty: name a new folder")
     target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{target.name}.") as temporary:
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=f".{cut_name(target.name, 200)}.") as temporary:
         folder = Path(temporary) / "made"
         folder.mkdir()
         yield folder

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from hm_sfm.config import fingerprint
 from hm_sfm.errors import ConfigError, InputError
 from hm_sfm.io.atomic import make_folder
+from hm_sfm.io.names import cut_name
 from hm_sfm.io.pictures import encode_picture
 from hm_sfm.photos.images import EXTENSIONS
 
@@ -73,7 +74,8 @@ def check_video(path: Path) -> str:
     """16 hex digits of a video's bytes. Raises InputError where its first frame cannot be decoded."""
     if not path.is_file():
         raise InputError(f"the video {path} " + ("is not a file" if path.exists() else "does not exist"))
-    if path.suffix.lower() in EXTENSIONS or next(read_frames(path), None) is None:
+    is_photo = path.suffix.lower() in EXTENSIONS and path.suffix.lower() != ".gif"  # which may move
+    if is_photo or next(read_frames(path), None) is None:
         raise InputError(f"{path} cannot be decoded as a video")
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:16]
@@ -96,7 +98,7 @@ def write_frames(video: Path, folder: Path, every_ms: int, image_format: str, ma
     with make_folder(folder) as temporary:
         rows = []
         for milliseconds, frame in choose_sharpest(count_frames(video, quiet), every_ms):
-            name = f"{video.stem}_{milliseconds:08d}.{image_format}"
+            name = f"{cut_name(video.stem, 200)}_{milliseconds:08d}.{image_format}"
             (temporary / name).write_bytes(encode_picture(frame, f".{image_format}"))
             rows.append((f"{folder.name}/{name}", f"{milliseconds / 1000:.3f}"))
         with open(temporary / TABLE, "w", newline="", encoding="utf-8") as file:

@@ -89,6 +89,13 @@ def test_pictures_of_photos_are_numbered_reduced_and_whole(tmp_path):
     assert np.abs(picture[400, 500].astype(int) - pick_colour(4.0)).max() < 12
 
 
+def test_pictures_of_photos_with_long_names(tmp_path):
+    pair = make_pair(tmp_path)
+    long = [path.rename(tmp_path / (path.stem * 200 + ".png")) for path in (pair.path0, pair.path1)]
+    MatchPictures(tmp_path / "pictures").draw_poses(PosePair(*long, K0, K1, pair.cam1_from_cam0), make_matches([], []))
+    assert [path.name for path in (tmp_path / "pictures").iterdir()] == [f"0000_{'a' * 100}-{'b' * 100}.png"]
+
+
 def test_point_pictures_take_grey_images(tmp_path):
     pictures = MatchPictures(tmp_path)
     images = np.zeros((2, 48, 64), np.uint8)

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from hm_sfm.cli import main
 from hm_sfm.errors import ConfigError, InputError
@@ -52,6 +53,19 @@ def test_the_sharpest_frame_of_each_second_with_its_time(suffix, tmp_path):
         rows = list(csv.reader(file))
     assert rows == [["name", "seconds"], *map(list, zip(names, ("0.300", "1.400", "2.000")))]
     assert sorted(path.name for path in photos.iterdir()) == ["walk"]
+
+
+def test_a_video_with_a_name_as_long_as_can_be(video, tmp_path):
+    long = video.rename(tmp_path / ("ü" * 125 + ".avi"))
+    frames = extract_frames([long], tmp_path / "photos", 1.0, quiet=True)
+    assert [image.name for image in list_images(tmp_path / "photos").images] == list(frames) and len(frames) == 3
+    assert all(name.startswith("ü" * 125 + "/" + "ü" * 100 + "_0000") for name in frames)
+
+
+def test_a_gif_that_moves_is_a_video(tmp_path):
+    pictures = [Image.fromarray(np.full((48, 64), 40 * k, np.uint8)) for k in range(4)]
+    pictures[0].save(tmp_path / "a.gif", save_all=True, append_images=pictures[1:], duration=1000)
+    assert len(extract_frames([tmp_path / "a.gif"], tmp_path / "photos", 1.0, quiet=True)) == 4
 
 
 def test_what_is_done_is_left_alone_and_the_rest_is_done(video, tmp_path):

@@ -73,9 +73,8 @@ def verify_pair(
     """Which matches agree with the two-view geometry of their images.
 
     camera0, camera1: of image 0 and 1; where both have a known focal length, the geometry is calibrated. Pairs that
-    see a plane, or that only rotate, are valid: matches then agree with a homography, or with an essential matrix, for
-    which unknown focal lengths are taken as the cameras have them. So are those of fisheye lenses, whose images have no
-    fundamental matrix.
+    see a plane, or that only rotate, are valid: matches then agree with a homography, or with an essential or
+    fundamental matrix. Fisheye images have no fundamental matrix: their focal lengths are taken for known.
     px_scale: of image 0 and 1, px of the stored image per px at the matching resolution.
 
     Returns (M,) bool, the same for the same seed; all False where fewer than `config.min_inliers` or a smaller part
@@ -91,21 +90,27 @@ def verify_pair(
         camera.has_prior_focal_length |= camera.is_perspective_fisheye()
     kind, inliers = _find_inliers(xy0, xy1, cameras, config.max_error_px, seed)
     if kind in PLANAR_KINDS and not all(camera.has_prior_focal_length for camera in cameras):
-        # COLMAP then looks for a homography only. Any focal length will do for an essential matrix of the plane and
-        # what stands before it: it has enough freedom to make up for the wrong one.
+        # COLMAP then looks for a homography only. Told that the focal lengths are known, it also looks for an essential
+        # and a fundamental matrix, which have room for the plane and for what stands before it.
         for camera in cameras:
             camera.has_prior_focal_length = True
-        inliers = max(inliers, _find_inliers(xy0, xy1, cameras, config.max_error_px, seed)[1], key=np.count_nonzero)
+        _, with_focal = _find_inliers(xy0, xy1, cameras, config.max_error_px, seed, try_fundamental=True)
+        inliers = max(inliers, with_focal, key=np.count_nonzero)
     accepted = np.count_nonzero(inliers) >= max(config.min_inliers, config.min_inlier_ratio * len(matches))
     return inliers if accepted else rejected
 
 
 def _find_inliers(
-    xy0: np.ndarray, xy1: np.ndarray, cameras: Sequence[pycolmap.Camera], max_error_px: float, seed: int
+    xy0: np.ndarray,
+    xy1: np.ndarray,
+    cameras: Sequence[pycolmap.Camera],
+    max_error_px: float,
+    seed: int,
+    try_fundamental: bool = False,
 ) -> tuple[int, np.ndarray]:
     """The kind of the two-view geometry of matches (M, 2), px as `cameras` have them, and (M,) bool: which agree.
 
-    The kind is a value of TwoViewGeometryConfiguration.
+    The kind is a value of TwoViewGeometryConfiguration. try_fundamental: focal lengths that are known may be wrong.
     """
     # Matches come best first: even steps keep the mixture of good and bad, and the spread over the image.
     chosen = np.linspace(0, len(xy0) - 1, min(len(xy0), FIT_MATCHES)).round().astype(np.int64)
@@ -132,6 +137,8 @@ def _find_inliers(
         if kind != int(KINDS.CALIBRATED) and geometry.H is not None:
             planar = _planar_inliers(xy0, xy1, geometry.H, max_error_px)
             inliers = max(inliers, planar, key=np.count_nonzero)
+        if try_fundamental and geometry.F is not None:
+            inliers = max(inliers, _epipolar_inliers(xy0, xy1, geometry.F, max_error_px), key=np.count_nonzero)
     return kind, inliers
 
 

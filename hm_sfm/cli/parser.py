@@ -17,7 +17,7 @@ EXAMPLES = """examples:
   hm-sfm reconstruct --help                list all options of a command
 
 To continue a command that was interrupted or killed, run it again.
-exit codes: 0 done, 2 bad arguments or input, 3 no model could be built, 130 interrupted"""
+exit codes: 0 done, 2 bad arguments or input, 3 no model could be built, 130 interrupted, 143 terminated"""
 
 CONFIG_OPTIONS = (
     ("--pairs", "pairs.mode", "auto|exhaustive|sequential|retrieval|spatial|FILE",

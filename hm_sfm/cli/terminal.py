@@ -1,5 +1,6 @@
 """The terminal of a command: streams that may be closed, progress bars that share them, signals that end it."""
 
+import io
 import logging
 import os
 import signal
@@ -41,7 +42,7 @@ def open_streams() -> None:
             nowhere = os.open(os.devnull, os.O_RDWR)
             setattr(sys, name, os.fdopen(nowhere, "r" if name == "stdin" else "w", encoding="utf-8"))
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
+        if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hm_sfm.config import ImageConfig, MatchingConfig
-from hm_sfm.geometry.frames import homography_to_pixel_index, pixel_index_from_px, rotation_matrix
+from hm_sfm.geometry.frames import flip_matrix, homography_to_pixel_index, pixel_index_from_px, rotation_matrix
 from hm_sfm.geometry.homographies import apply_homographies
 from hm_sfm.matching.feature_cache import cache_features, match_pair
 from hm_sfm.matching.hypotheses import (
@@ -28,8 +28,9 @@ from hm_sfm.matching.hypotheses import (
     relate_scales,
 )
 from hm_sfm.matching.matcher import HomoMatcher
+from hm_sfm.photos.exif import write_jpeg
 from hm_sfm.photos.hypotheses import IDENTITY, Hypothesis, apply_hypothesis
-from hm_sfm.photos.images import prepare_array, prepare_image, read_ref, read_rgb
+from hm_sfm.photos.images import list_images, prepare_array, prepare_image, read_ref, read_rgb
 from hm_sfm.photos.orientation import CV_ROTATIONS
 from hm_sfm.synthetic.textures import MATERIALS, make_texture
 from hm_sfm.types import ImagePair, PatchMatches
@@ -197,6 +198,21 @@ def test_neither_order_nor_memory_matter(matcher, folder, one_thread):
     # The same as of the photos without a cache.
     direct = matcher.match(folder / "a.png", folder / "b.png")
     assert direct.xy1.tobytes() == found[0][pairs[0]].xy1.tobytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("orientation", [2, 5])
+def test_mirrored_photos_match_as_they_are_shown(upright, tmp_path, photo, other, orientation):
+    """Points of `match` are those of the stored pixels, which are mirrored; those of a run make a scene that is not."""
+    stored = other[:, ::-1] if orientation == 2 else other.T
+    for name, pixels, tag in (("a.jpg", photo, 1), ("b.jpg", stored, orientation)):
+        write_jpeg(tmp_path / name, np.dstack([pixels] * 3), None, tag)
+    stored_from_other = np.array([[-1, 0, 256], [0, 1, 0], [0, 0, 1.0]] if orientation == 2 else np.eye(3)[[1, 0, 2]])
+    assert_right(upright.match(tmp_path / "a.jpg", tmp_path / "b.jpg"), stored_from_other @ SHIFT, 350)
+    cache = cache_features(list_images(tmp_path).images, upright)
+    in_run = match_pair(cache, ImagePair("a.jpg", "b.jpg"))
+    assert_right(in_run, flip_matrix(stored.shape[1]) @ stored_from_other @ SHIFT, 350)
+    assert (np.linalg.det(in_run.homography) > 0).all()
 
 
 def test_given_matches_of_turned_photos_become_homographies(matcher, folder, tmp_path):

@@ -1,13 +1,17 @@
 """The sizes at which photos are matched: ordinary ones by their longer side, panoramas by their pixels."""
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hm_sfm.config import ImageConfig
 from hm_sfm.errors import InputError
+from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.photos.images import prepare_array
 from hm_sfm.photos.sizes import check_size, find_scale, measure_px_scale
+from hm_sfm.synthetic.textures import MATERIALS, make_texture
 
 
 @given(longer=st.integers(32, 20_000), aspect=st.floats(1, 3), long_edge_px=st.integers(32, 4096))
@@ -58,3 +62,15 @@ def test_photos_that_are_too_small_or_too_long(size_wh, reason):
     with pytest.raises(InputError, match=f"^{reason}$"):
         check_size(size_wh, "a.jpg")
     check_size((64_000, 64), "a.jpg")
+
+
+@pytest.mark.slow
+def test_panoramas_match():
+    rng = np.random.default_rng(4)
+    tiles = [make_texture(rng, list(MATERIALS)[k % len(MATERIALS)], (2.5, 2.5), 100) for k in range(9)]
+    scene = cv2.cvtColor(np.hstack(tiles), cv2.COLOR_RGB2GRAY)
+    left, right = scene[:240, :2000], scene[10:250, 200:2200]
+    matches = HomoMatcher.from_pretrained("light", images=ImageConfig(long_edge_px=320)).match(left, right)
+    good = matches.select(matches.score >= 0.5)
+    errors_px = np.linalg.norm(good.xy0 - (200, 10) - good.xy1, axis=1)
+    assert len(good) > 300 and np.median(errors_px) < 1

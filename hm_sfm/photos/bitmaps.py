@@ -55,10 +55,11 @@ def read_bitmap(path: Path, as_rgb: bool) -> pycolmap.Bitmap | None:
         return bitmap
     try:
         head = _read_head(path)
-        if head[4:8] == b"ftyp" and head[8:12] in HEIC_BRANDS:
-            return _read_heic(Path(path), as_rgb)
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
-            return _hand_to_colmap(image, as_rgb)
+        with warnings.catch_warnings(action="ignore"):
+            if head[4:8] == b"ftyp" and head[8:12] in HEIC_BRANDS:
+                return _read_heic(Path(path), as_rgb)
+            with Image.open(path) as image:
+                return _hand_to_colmap(image, as_rgb)
     except (ValueError, OSError, RuntimeError, SyntaxError, EOFError, Image.DecompressionBombError):
         return None
 

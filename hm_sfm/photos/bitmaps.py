@@ -60,7 +60,9 @@ def read_bitmap(path: Path, as_rgb: bool) -> pycolmap.Bitmap | None:
                 return _read_heic(Path(path), as_rgb)
             with Image.open(path) as image:
                 return _hand_to_colmap(image, as_rgb)
-    except (ValueError, OSError, RuntimeError, SyntaxError, EOFError, Image.DecompressionBombError):
+    except MissingPackageError:
+        raise
+    except Exception:  # of damaged files: all kinds of errors
         return None
 
 
@@ -95,8 +97,8 @@ def lacks_range(path: Path) -> bool:
             directory.load(file)
             formats, bits = directory.get(SAMPLE_FORMAT, (1,)), directory.get(BITS_PER_SAMPLE, (1,))
             return FLOAT in formats or max(bits) > 16
-    except (ValueError, OSError, SyntaxError, TypeError, EOFError):
-        return False  # damaged: decoding it says so
+    except Exception:  # of damaged files: all kinds of errors; decoding them says so
+        return False
 
 
 def read_deep_tiff(data: bytes, ref: ImageRef) -> np.ndarray | None:
@@ -119,7 +121,8 @@ def read_deep_tiff(data: bytes, ref: ImageRef) -> np.ndarray | None:
 
 def _spread_values(values: np.ndarray) -> np.ndarray:
     """(H, W) numbers of any kind -> (H, W) uint16, see read_deep_tiff; what is no number becomes black."""
-    values = values.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of what is no number
+        values = values.astype(np.float64)
     known = values[np.isfinite(values)]
     if not len(known):
         return np.zeros(values.shape, np.uint16)
@@ -204,8 +207,8 @@ def read_alpha(image: ImageRef) -> np.ndarray | None:
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(image.path) as file:
             alpha = np.array(file.convert("RGBA").getchannel("A")) if file.has_transparency_data else None
-    except (ValueError, OSError, SyntaxError, EOFError, Image.DecompressionBombError):
-        return None  # what cannot be read has no alpha; that it cannot be read is said elsewhere
+    except Exception:  # of damaged files: all kinds of errors, and that they cannot be read is said elsewhere
+        return None
     if alpha is None or alpha.shape != (image.size_wh[1], image.size_wh[0]) or (alpha == 255).all():
         return None
     return np.ascontiguousarray(alpha[:, ::-1]) if image.flipped else alpha

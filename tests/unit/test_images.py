@@ -1,6 +1,7 @@
 """Listing and preparing photos: odd formats, turned photos, damaged files."""
 
 import base64
+import contextlib
 import logging
 import struct
 from pathlib import Path
@@ -411,6 +412,21 @@ def test_values_that_are_no_numbers_are_black(tmp_path):
     write(path, grey_tiff(values, 1, sample_format=3))
     grey = prepare_image(read_ref(path), 64).grey
     assert not grey[:10].any() and grey[10:30].min() == 0 and grey[10:30].max() == 1
+
+
+@pytest.mark.parametrize("extension", [".jpg", ".png", ".tif", ".bmp", ".webp"])
+def test_no_byte_of_a_photo_ends_a_run(tmp_path, extension):
+    """Either it is used or skipped; whatever Pillow, OpenCV and COLMAP think of it, no other error comes through."""
+    whole = np.frombuffer(encode(textured(64, 48), extension), np.uint8)
+    rng = np.random.default_rng(0)
+    for count in (1, 2, 8) * 20:
+        data = whole.copy()
+        data[rng.integers(0, rng.choice([40, 200, len(data)]), count)] = rng.integers(0, 256, count)
+        path = write(tmp_path / f"a{extension}", data.tobytes())
+        with contextlib.suppress(InputError):
+            ref = read_ref(path)
+            if np.prod(ref.size_wh) < 1e6:
+                assert read_rgb(prepare_image(ref, 64)).shape[2] == 3
 
 
 def test_an_impossible_matching_size_is_a_configuration_error():

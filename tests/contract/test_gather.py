@@ -173,3 +173,13 @@ def test_baselines_are_those_of_the_same_run(tmp_path):
     for damaged in ("{", "[]", json.dumps({**comparison, "methods": {"loftr_style_raw": 3}})):
         path.write_text(damaged)
         assert read_baselines(path, 5, Config()) == {}
+
+
+def test_the_scene_of_a_model_in_utm_coordinates_loses_nothing(run, report):
+    """The page is in single precision."""
+    _, images, model = run
+    utm = pycolmap.Reconstruction(model)
+    utm.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), [500000.0, 4649776.0, 120.0]))
+    scene = lay_out_scene(utm, {image.name: image.rotation_deg for image in images})
+    np.testing.assert_allclose(scene.xyz, report.scene.xyz, atol=1e-6)
+    np.testing.assert_allclose(scene.frusta, report.scene.frusta, atol=1e-6)

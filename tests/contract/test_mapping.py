@@ -175,13 +175,32 @@ def test_nothing_to_map_gives_no_model(tmp_path, oracle, with_matches):
     write_database(path, oracle.images, Cameras((camera,), (0,) * 6), oracle.keypoints, matches)
     if not with_matches:
         verify_database(path, VerificationConfig())
-    (tmp_path / "sparse" / "0").mkdir(parents=True)
     assert map_incrementally(MappingTask(path, tmp_path, tmp_path / "sparse")) == ()
     assert [entry.name for entry in tmp_path.iterdir()] == ["database.db"]
 
     result = summarise_models((), num_images=6)
     assert (result.models, result.num_images, result.registered, result.points) == ((), 6, 0, 0)
     assert (result.mean_track_length, result.mean_reprojection_px) == (0.0, 0.0)
+
+
+def test_a_run_without_a_model_leaves_that_of_the_run_before_and_one_with_a_model_its_frame(tmp_path, oracle):
+    path = write_and_verify(tmp_path, oracle, make_known_camera(oracle))
+    task = MappingTask(path, tmp_path, tmp_path / "sparse", fix_intrinsics=True)
+    (model,) = map_incrementally(task)
+    model.transform(pycolmap.Sim3d(3.0, pycolmap.Rotation3d(np.array([0.5, 0.1, 2.0])), [500000.0, 4649776.0, 120.0]))
+    (tmp_path / "sparse" / "aligned").mkdir()
+    for name in ("0", "aligned"):
+        model.write_binary(tmp_path / "sparse" / name)
+    write_database(path, oracle.images, Cameras((make_known_camera(oracle),), (0,) * 6), oracle.keypoints, [])
+    assert map_incrementally(task) == ()
+    assert sorted(folder.name for folder in (tmp_path / "sparse").glob("*/")) == ["0", "aligned"]
+
+    write_and_verify(tmp_path, oracle, make_known_camera(oracle))
+    (again,) = map_incrementally(task)
+    for image_id in model.reg_image_ids():
+        placed, before = (one.image(image_id).projection_center() for one in (again, model))
+        np.testing.assert_allclose(placed, before, atol=0.05)
+    assert sorted(folder.name for folder in (tmp_path / "sparse").glob("*/")) == ["0", "0_kept", "aligned"]
 
 
 def test_ctrl_c_leaves_the_earlier_models_and_nothing_else(tmp_path, oracle):
@@ -433,7 +452,6 @@ def test_the_global_mapper_builds_the_oracle(tmp_path, oracle, known, capfd):
     camera = make_known_camera(oracle) if known else make_unknown_camera(oracle)
     path = write_and_verify(tmp_path, oracle, camera)
     before = read_geometry(path)
-    (tmp_path / "sparse" / "3").mkdir(parents=True)  # of an earlier run
     registered = []
     config = MappingConfig(mapper="global")
     cameras = Cameras((camera,), (0,) * 6, known=known)

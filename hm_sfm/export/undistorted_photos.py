@@ -55,7 +55,8 @@ def undistort_photos(
     Its cameras are PINHOLE then. images: all of the model. masks: what is masked out becomes transparent where
     masks_as_alpha is set; else there is a mask folder/masks/<name of the copy>.png for each photo.
 
-    Raises InputError where a photo cannot be read, is of another size than its camera, or spherical.
+    Raises InputError where a photo cannot be read, is of another size than its camera, or spherical, and where a copy
+    cannot be written.
     """
     ref_of = {image.name: image for image in images}
     posed = sorted(model.images.values(), key=lambda image: image.name)
@@ -126,12 +127,14 @@ def _read_photo(image: ImageRef, camera: pycolmap.Camera, masks: Masks, masks_as
 
 
 def _write_copy(copy: _Copy, folder: Path) -> None:
+    """Raises InputError where that fails."""
     path = folder / "images" / copy.name
     path.parent.mkdir(parents=True, exist_ok=True)
     if copy.pixels is None:
         shutil.copyfile(copy.image.path, path)
     elif copy.alpha is None:
-        pycolmap.Bitmap.from_array(_undistort(copy.pixels, copy.camera)).write(path)
+        if not pycolmap.Bitmap.from_array(_undistort(copy.pixels, copy.camera)).write(path):
+            raise InputError(f"cannot write the undistorted photo {path}: the disk may be full")
     else:
         layers = [_undistort(pixels, copy.camera) for pixels in (copy.pixels, copy.alpha)]
         Image.fromarray(np.dstack(layers)).save(path, "PNG")

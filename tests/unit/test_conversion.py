@@ -199,6 +199,13 @@ def test_photos_of_another_size_than_their_camera(out, tmp_path):
         convert_run(out, "3dgs", tmp_path / "3dgs")
 
 
+def test_a_full_disk_is_no_success(out, tmp_path, monkeypatch):
+    monkeypatch.setattr(pycolmap.Bitmap, "write", lambda *_: False)
+    with pytest.raises(InputError, match=r"cannot write the undistorted photo .*left/1.png"):
+        convert_run(out, "3dgs", tmp_path / "3dgs")
+    assert not (tmp_path / "3dgs").exists()
+
+
 # Orientation, transparency, masks
 
 

@@ -102,8 +102,8 @@ class MatchingConfig:
     """In pairs with fewer good matches than this, these grow to neighbours that the coarse stage missed. Matches of
     keypoints (network.coarse context) are sparse and always grow. 0, as in the paper, grows none."""
     try_hypotheses: bool = True
-    """Pairs with few good matches are tried with one photo rotated by quarter turns and reduced to 1/2 and 1/3, and are
-    matched again where that fits clearly better."""
+    """Pairs with few good matches are tried with one photo rotated in steps of 45 degrees and reduced to 1/2 and 1/3,
+    and are matched again where that fits clearly better."""
     feature_cache_mb: int = 1500
     """Memory for the features of photos in each process that matches. It must hold two photos."""
     device: Literal["auto", "cpu", "cuda"] = "auto"

@@ -4,8 +4,8 @@
 
 Each version of the fine stage starts from the same features with a new head and trains for the same few steps. FILE
 holds a network with a trained coarse transformer: it is scored with the transformer, and without it by mutual nearest
-neighbours of the plain features; without FILE there is no third table. SCENE has the layout of Strecha's data sets:
-images/, gt_dense_cameras/ and K.txt.
+neighbours of the plain features, both at one precision; without FILE there is no third table. SCENE has the layout of
+Strecha's data sets: images/, gt_dense_cameras/ and K.txt.
 
 Each version has a folder of its own below the configuration's `out`: an interrupted run goes on from there and repeats
 nothing. After a change of code, photos, scene or weights, take a new `out`.
@@ -16,7 +16,6 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from ablation_scores import (
@@ -27,6 +26,7 @@ from ablation_scores import (
     describe_trial,
     drop_head,
     drop_transformer,
+    equalise_precision,
     prepare_trial,
     score_matches,
     score_net,
@@ -75,17 +75,27 @@ def score_version(config: TrainConfig, trial: Trial) -> Scores:
     config = replace(config, out=str(Path(config.out) / f"{net.head}-{size}-{config.supervise}"))
     print(config.out, file=sys.stderr)
     stored = Path(config.out) / f"scores-{trial.key}.json"
-    return score_once(stored, lambda: score_matches(load_weights(str(train(config, resume=True))), trial))
+    # The features are matched by their cosines, which have a threshold of their own.
+    return score_once(
+        stored, lambda: score_matches(load_weights(str(train(config, resume=True))), trial, config.coarse_threshold)
+    )
 
 
 def score_coarse(weights: Path, trial: Trial) -> dict[str, Scores]:
-    """A network with its coarse transformer and without it. Raises ConfigError where it has none."""
+    """A network with its coarse transformer and without it, at the same precision; ConfigError where it has none."""
     net = load_weights(str(weights))
     if net.config.coarse != "attention":
         raise ConfigError(f"{weights} has no coarse transformer: network.coarse is {net.config.coarse!r}")
     folder = Path(trial.config.out) / f"coarse-{digest_weights(str(weights))[:8]}"
-    nets = {"with": net, "without": drop_transformer(net)}
-    return {row: score_once(folder / f"{row}-{trial.key}.json", partial(score_net, nets[row], trial)) for row in nets}
+    plain = drop_transformer(net)
+
+    def score_with_transformer() -> Scores:
+        return score_net(net, trial, equalise_precision(net, trial, without["precision"]))
+
+    without = score_once(
+        folder / f"without-{trial.key}.json", lambda: score_net(plain, trial, trial.config.coarse_threshold)
+    )
+    return {"with": score_once(folder / f"with-{trial.key}.json", score_with_transformer), "without": without}
 
 
 def format_markdown(rows: Mapping[str, Mapping[str, float]], columns: Sequence[str]) -> str:

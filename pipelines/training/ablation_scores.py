@@ -41,7 +41,9 @@ TIMED_PATCHES = 2000
 TIMED_CALLS = 9
 
 POINTS = ("PCK@1", "PCK@3", "centre@1", "centre@3", "AUC@5")
-CELLS = ("recall", "precision", "real recall", "real precision")
+CELLS = ("threshold", "recall", "precision", "real recall", "real precision")
+CONFIDENCES = (0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7)
+"""What `equalise_precision` chooses from."""
 
 Scores = dict[str, float]
 
@@ -97,32 +99,48 @@ def score_once(path: Path, score: Callable[[], Scores]) -> Scores:
     return json.loads(path.read_text())
 
 
-def make_matcher(net: HomoNet, config: TrainConfig) -> HomoMatcher:
-    """The network with the threshold of confidence that its coarse stage is trained for."""
-    matching = MatchingConfig(min_confidence=config.coarse_threshold, device=config.device)
+def make_matcher(net: HomoNet, config: TrainConfig, min_confidence: float) -> HomoMatcher:
+    matching = MatchingConfig(min_confidence=min_confidence, device=config.device)
     return HomoMatcher.from_network(net, matching, ImageConfig())
 
 
-def score_cells(net: HomoNet, trial: Trial) -> Scores:
-    """`recall` and `precision` of a network's coarse stage, and `real` ones on real photos, in percent."""
-    matcher, batches = make_matcher(net, trial.config), [collate_pairs([pair]) for pair in (*trial.known, *trial.real)]
+def score_cells(net: HomoNet, trial: Trial, min_confidence: float) -> Scores:
+    """`recall` and `precision` of a network's coarse stage, and `real` ones on real photos, in percent.
+
+    `threshold`, in percent: the least score of its matches; min_confidence, where they have confidences.
+    """
+    matcher = make_matcher(net, trial.config, min_confidence)
+    batches = [collate_pairs([pair]) for pair in (*trial.known, *trial.real)]
     threshold, precision = choose_threshold(net, matcher.config), trial.config.precision
     scores = score_network(net, batches, "coarse", 0, threshold, precision, matcher.device, torch.Generator())
-    return {name.replace("rendered_", "").replace("_", " "): value for name, value in scores.items()}
+    named = {name.replace("rendered_", "").replace("_", " "): value for name, value in scores.items()}
+    return {"threshold": 100 * threshold} | named
 
 
-def score_net(net: HomoNet, trial: Trial) -> Scores:
+def equalise_precision(net: HomoNet, trial: Trial, precision: float) -> float:
+    """Of CONFIDENCES the one at which the precision of a network's coarse matches is nearest to that of another.
+
+    precision: percent. Two stages whose scores mean different things are comparable at one precision only.
+    """
+
+    def measure(min_confidence: float) -> float:
+        return abs(score_cells(net, trial, min_confidence)["precision"] - precision)
+
+    return min(CONFIDENCES, key=measure)
+
+
+def score_net(net: HomoNet, trial: Trial, min_confidence: float) -> Scores:
     """All metrics of a network: CELLS, and what score_matches measures."""
-    return score_cells(net, trial) | score_matches(net, trial)
+    return score_cells(net, trial, min_confidence) | score_matches(net, trial, min_confidence)
 
 
-def score_matches(net: HomoNet, trial: Trial) -> Scores:
+def score_matches(net: HomoNet, trial: Trial, min_confidence: float) -> Scores:
     """Metrics of a network's matches.
 
     `PCK` of the points that its patches cover, `centre` of the patches' centres alone and `AUC@5` of poses, all in
     percent, and `ms` of its stages.
     """
-    matcher, scores = make_matcher(net, trial.config), {}
+    matcher, scores = make_matcher(net, trial.config, min_confidence), {}
     errors = [measure_matches(matcher, pair) for pair in trial.known]
     for name, parts in zip(("PCK", "centre"), zip(*errors)):
         pooled = np.concatenate(parts)
@@ -229,8 +247,9 @@ supervised. With spacing 2 every second cell of a patch is looked up along each 
 are wider.
 
 - `recall` and `precision`, in percent: the share of the true coarse matches that are matched, and the share of these
-  that are right to within a cell. {PAIRS} pairs of {SIZE_WH[0]} x {SIZE_WH[1]} px, made of photos held out from
-  training{real}.
+  that are right to within a cell, at a `threshold`, percent, of the cosine (without the transformer) or the confidence
+  (with it, where the precision is nearest to that without it). {PAIRS} pairs of {SIZE_WH[0]} x {SIZE_WH[1]} px, made of
+  photos held out from training{real}.
 - `PCK@1` and `PCK@3`: visible points of the matched patches that are within 1 and 3 px of the ground truth, in
   percent, on the same pairs; all points of a wrong coarse match count. `centre`: the centres of the patches
   alone.

@@ -68,7 +68,11 @@ def test_ablate(ablate, tmp_path, monkeypatch, matched_pairs):
         "", "semi-dense", "+ dense", "+ suppressed", "", "expectation", "9/1/2, spacing 2", "", "with", "without",
     ]  # fmt: skip
     assert cells[0][1:] == ["PCK@1", "PCK@3", "centre@1", "centre@3", "AUC@5"]
-    assert cells[5][-1] == "fine ms" and cells[9][1:3] == ["recall", "precision"] and cells[9][-1] == "coarse ms"
+    assert (
+        cells[5][-1] == "fine ms"
+        and cells[9][1:4] == ["threshold", "recall", "precision"]
+        and cells[9][-1] == "coarse ms"
+    )
     assert all(0 <= float(value) <= 100 for line in cells[2:5] for value in line[1:])
     # What the first table's last row tells is the same network.
     assert cells[4][1:] == cells[8][1:-1]
@@ -87,6 +91,14 @@ def test_ablate(ablate, tmp_path, monkeypatch, matched_pairs):
     assert ablate(*weights).strip() == f"## {tables}"
     assert ablate().count("## ") == 2
     assert matched_pairs == []
+
+
+def test_two_coarse_stages_are_compared_at_one_precision(monkeypatch):
+    monkeypatch.syspath_prepend(TRAINING)
+    scores = importlib.import_module("ablation_scores")
+    measured = {0.01: 55.0, 0.02: 61.0, 0.05: 68.0, 0.1: 76.0}
+    monkeypatch.setattr(scores, "score_cells", lambda net, trial, limit: {"precision": measured.get(limit, 95.0)})
+    assert [scores.equalise_precision(None, None, precision) for precision in (70.0, 74.0, 40.0)] == [0.05, 0.1, 0.01]
 
 
 def test_ablate_refuses_weights_without_a_transformer(ablate, tmp_path, capfd):

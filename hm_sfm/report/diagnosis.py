@@ -46,7 +46,7 @@ LARGER = "--set images.long_edge_px=1600"
 INTRINSICS = "known intrinsics: --camera-model and --camera-params"
 OWN_CAMERAS = "--camera-mode per-image"
 FISHEYE = "--camera-model OPENCV_FISHEYE if the lens is a fisheye"
-MASKS = "masks (--masks or --camera-mask) of what stays where it is in the frame"
+MASKS = "masks of what stays where it is in the frame (--masks, --camera-mask)"
 ADVICE = {
     Cause.UNPAIRED: (ALL_PAIRS,),
     Cause.FEW_MATCHES: (BETWEEN, ALL_PAIRS, LARGER),

@@ -117,7 +117,7 @@ def test_masks_are_advised_where_matches_stay_in_their_places(run):
     (moving,) = run.diagnose()
     run.moves_px = 2.0  # half a px of the matching resolution
     (still,) = run.diagnose()
-    assert still.advice == ("masks (--masks or --camera-mask) of what stays where it is in the frame", *moving.advice)
+    assert still.advice == ("masks of what stays where it is in the frame (--masks, --camera-mask)", *moving.advice)
 
 
 def test_matches_that_disagree_may_be_those_of_a_fisheye_lens(run):

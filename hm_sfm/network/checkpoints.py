@@ -67,7 +67,9 @@ def load_weights(name: str, network: NetworkConfig | None = None) -> HomoNet:
     if made_for.coarse == "context" and wanted.coarse == "cosine":  # the same network without what sees the context
         made_for = dataclasses.replace(made_for, coarse="cosine")
         state_dict = {key: value for key, value in state_dict.items() if not key.startswith(CONTEXT_PARTS)}
-    if made_for.coarse == "cosine" and wanted.coarse == "context":
+    # The first files do not name their coarse stage, which is then taken for the default.
+    lacks_context = isinstance(state_dict, dict) and not any(str(key).startswith(CONTEXT_PARTS) for key in state_dict)
+    if wanted.coarse == "context" and (made_for.coarse == "cosine" or (made_for.coarse == "context" and lacks_context)):
         raise WeightsError(
             f"{path} has no context stage: take network.coarse cosine, or add one to it with "
             "pipelines/training/add_context.py"

@@ -153,6 +153,17 @@ def test_weights_without_context_are_refused_with_what_to_do(tmp_path):
         load_weights(str(tmp_path / "cells.pt"), NetworkConfig())
 
 
+def test_weights_that_do_not_name_their_coarse_stage_are_refused_with_what_to_do(tmp_path):
+    """As the first ones did not, which had none."""
+    save_weights(tmp_path / "first.pt", load_weights("light", NetworkConfig(coarse="cosine")))
+    content = torch.load(tmp_path / "first.pt", weights_only=True)
+    del content["network"]["coarse"]
+    torch.save(content, tmp_path / "first.pt")
+    for network in (None, NetworkConfig()):
+        with pytest.raises(WeightsError, match=r"first.pt has no context stage: take network.coarse cosine, or add"):
+            load_weights(str(tmp_path / "first.pt"), network)
+
+
 def test_fewer_keypoints_are_the_best_ones(photos):
     net = load_weights("light")
     image = prepare_array(photos[0], 1024)

@@ -48,7 +48,8 @@ class NetworkConfig:
 @dataclass(frozen=True)
 class ImageConfig:
     long_edge_px: int = 1024
-    """The matching resolution: photos are reduced to this, never enlarged. Keypoints are px of the stored photo."""
+    """The matching resolution: photos are reduced to this, never enlarged; of panoramas of more than 3:1, the shorter
+    side is reduced to a third of it or less. Keypoints are px of the stored photo."""
 
 
 @dataclass(frozen=True)

@@ -339,6 +339,15 @@ def test_point_pairs_in_either_order(tmp_path, swapped_file, swapped_call):
     assert found.score.tolist() == [0.25, 0.5]
 
 
+def test_points_of_mirrored_photos_are_those_of_the_stored_pixels(tmp_path):
+    """In a run, a prepared photo maps to the flipped one, in which the point at x = 100 is at 512 - 100."""
+    path = write_points(tmp_path / "m.h5")
+    features = [make_features(name) for name in NAMES]
+    features[0].image = dataclasses.replace(features[0].image, mirrored=True, flipped=True)
+    found = MatchFile(path).match(*features)
+    assert found.xy0.tolist() == [[256 - 50, 25], [256 - 3.875, 1.75]] and found.xy1.tolist() == [[5, 10], [0.75, 1.25]]
+
+
 def test_scores_may_be_missing_and_matches_too(tmp_path):
     features = [make_features(name) for name in NAMES]
     path = write_points(tmp_path / "m.h5", scores=None)

@@ -9,7 +9,7 @@ import numpy as np
 
 from hm_sfm.errors import InputError
 from hm_sfm.formats.hloc import find_group, open_h5, read_features, read_pair
-from hm_sfm.geometry.frames import px_from_pixel_index
+from hm_sfm.geometry.frames import flip_matrix, px_from_pixel_index
 from hm_sfm.io.arrays import open_group, read_array
 from hm_sfm.matching.interfaces import ImageFeatures, PointPairs
 from hm_sfm.photos.images import PreparedImage
@@ -48,6 +48,8 @@ class MatchFile:
         xy = {}
         for features, points in zip(sides, stored):
             scaled_from_stored = np.linalg.inv(features.stored_from_scaled)
+            if features.image.flipped:  # others know the photo as it is stored
+                scaled_from_stored = scaled_from_stored @ flip_matrix(features.image.size_wh[0])
             xy[features.image.name] = points @ scaled_from_stored[:2, :2].T + scaled_from_stored[:2, 2]
         return PointPairs(xy[features0.image.name], xy[features1.image.name], score)
 

@@ -12,7 +12,7 @@ from hm_sfm.colmap.cameras import Cameras
 from hm_sfm.colmap.database import open_database, read_verified_matches
 from hm_sfm.colmap.overlays import STILL_PX, measure_moves
 from hm_sfm.config import Config
-from hm_sfm.photos.sizes import measure_px_scale
+from hm_sfm.photos.sizes import find_scale, measure_px_scale
 from hm_sfm.types import ImagePair, ImageRef, PairMatches
 
 MOST_LISTED = 4
@@ -251,7 +251,7 @@ def choose_advice(cause: Cause, names: Sequence[str], evidence: Evidence) -> tup
     count = len(evidence.images)
     useless = {
         ALL_PAIRS: len(evidence.pairs) == count * (count - 1) // 2,
-        LARGER: max(max(evidence.images[name].size_wh) for name in names) <= config.images.long_edge_px
+        LARGER: all(find_scale(evidence.images[name].size_wh, config.images.long_edge_px) == 1 for name in names)
         or config.images.long_edge_px >= 1600,
         INTRINSICS: not any(evidence.may_lack_intrinsics(name, cause) for name in names),
         FISHEYE: evidence.cameras_known or all(evidence.cameras[name].is_perspective_fisheye() for name in names),

@@ -28,8 +28,9 @@ PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 TIFF_MAGICS = (b"II*\0", b"MM\0*")
 COLMAP_MAGICS = (JPEG_MAGIC, PNG_MAGIC, *TIFF_MAGICS, b"BM", b"P5", b"P6")
 """How files begin that COLMAP can read."""
-HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
-"""After the 4 bytes of a length and `ftyp`; AVIF has brands of its own."""
+HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx")
+"""One of them is in the list after the 4 bytes of a length and `ftyp`; AVIF has brands of its own."""
+HEAD_BYTES = 64
 
 # Numbers of tags and values in the TIFF 6.0 standard.
 BITS_PER_SAMPLE, SAMPLE_FORMAT, FLOAT = 258, 339, 3
@@ -56,7 +57,7 @@ def read_bitmap(path: Path, as_rgb: bool) -> pycolmap.Bitmap | None:
     try:
         head = _read_head(path)
         with warnings.catch_warnings(action="ignore"):
-            if head[4:8] == b"ftyp" and head[8:12] in HEIC_BRANDS:
+            if head[4:8] == b"ftyp" and any(brand in head for brand in HEIC_BRANDS):
                 return _read_heic(Path(path), as_rgb)
             with Image.open(path) as image:
                 return _hand_to_colmap(image, as_rgb)
@@ -162,7 +163,7 @@ def is_read_by_colmap(path: Path) -> bool:
 
 def _read_head(path: Path) -> bytes:
     with open(path, "rb") as file:
-        return file.read(12)
+        return file.read(HEAD_BYTES)
 
 
 @contextmanager

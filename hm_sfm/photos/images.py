@@ -7,6 +7,7 @@ when decoded.
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -92,6 +93,7 @@ def list_images(folder: Path) -> ImageList:
     folder = Path(folder)
     names = find_files(folder)
     kinds = EXTENSIONS + HEIC_EXTENSIONS if can_read_heic() else EXTENSIONS
+    names = _leave_out_twins(names, kinds)
     candidates = [name for name in names if Path(name).suffix.lower() in kinds + UNREADABLE_EXTENSIONS]
     heic = [name for name in names if Path(name).suffix.lower() in set(HEIC_EXTENSIONS).difference(kinds)]
     if not candidates and not heic:
@@ -115,6 +117,16 @@ def list_images(folder: Path) -> ImageList:
             f"the image folder {folder} holds {len(skipped)} images but none can be used, for example: {skipped[0][1]}"
         )
     return ImageList(tuple(images), tuple(sorted(skipped)))
+
+
+def _leave_out_twins(names: Sequence[str], kinds: Sequence[str]) -> list[str]:
+    """The files without raw photos beside which there is a photo of one of the `kinds` with the same name."""
+    photos = {Path(name).with_suffix("") for name in names if Path(name).suffix.lower() in kinds}
+    raw = [name for name in names if Path(name).suffix.lower() in RAW_EXTENSIONS]
+    twins = [name for name in raw if Path(name).with_suffix("") in photos]
+    if twins:
+        logger.warning("left out: %d raw photos beside photos of the same name, such as %s", len(twins), twins[0])
+    return sorted(set(names).difference(twins))
 
 
 def read_ref(path: Path, name: str | None = None) -> ImageRef:

@@ -168,6 +168,18 @@ def test_photos_of_kinds_that_nothing_reads_are_named(tmp_path, caplog):
     assert caplog.messages == [f"skipped: {reason}" for _, reason in listing.skipped]
 
 
+def test_raw_photos_beside_their_jpegs_are_told_in_one_line(tmp_path, caplog):
+    for name in ("IMG_1.jpg", "IMG_1.CR2", "IMG_2.jpg", "IMG_2.CR2", "sub/IMG_1.CR2"):
+        write(tmp_path / name, encode(textured(64, 48)))
+    listing = list_images(tmp_path)
+    assert [ref.name for ref in listing.images] == ["IMG_1.jpg", "IMG_2.jpg"]
+    assert [name for name, _ in listing.skipped] == ["sub/IMG_1.CR2"]
+    assert caplog.messages == [
+        "left out: 2 raw photos beside photos of the same name, such as IMG_1.CR2",
+        f"skipped: {tmp_path / 'sub/IMG_1.CR2'} is of a kind that cannot be read: convert it to JPEG, PNG or TIFF",
+    ]
+
+
 def damage(jpeg: bytes, kind: str) -> bytes:
     """As a failing card does it, or as a motion photo whose scan ends early, before its video."""
     half = len(jpeg) // 2

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image, ImageOps
 
 from hm_sfm.colmap.database import open_database, read_verified_matches
 from hm_sfm.evaluation.poses import score_model
@@ -126,3 +127,12 @@ def test_a_mixed_folder_becomes_one_model_in_stored_pixels(mixed, tmp_path, run,
         assert is_hidden(name, np.concatenate(xy), mixed).sum() > 50
         assert not is_hidden(name, xy_of[name], mixed).any()
         assert len(xy_of[name]) > 100
+
+    # Converted photos lie as the model sees them, with their masks.
+    assert run("convert", out, "--to", "nerfstudio", tmp_path / "converted").code == 0
+    for frame in json.loads((tmp_path / "converted" / "transforms.json").read_text())["frames"]:
+        name = frame["file_path"].removeprefix("images/")
+        with Image.open(tmp_path / "converted" / frame["file_path"]) as photo:
+            assert ImageOps.exif_transpose(photo).size == photo.size == (frame["w"], frame["h"])
+        mask = cv2.imread(str(tmp_path / "converted" / frame["mask_path"]), cv2.IMREAD_GRAYSCALE)
+        assert mask.shape == (frame["h"], frame["w"]) and (0 in mask) == (name in HIDDEN)

@@ -136,6 +136,8 @@ class VerificationConfig:
     """The ratio that a pair with only min_inliers needs. With more inliers, the ratio needed falls, to min_inlier_ratio
     at sure_inliers. By chance, a third of the matches of two different places agree with an epipolar geometry."""
     sure_inliers: int = 300
+    judge: bool = True
+    """Pairs and matches that loops through third photos contradict are given up: twins of facades, rooms and doors."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from hm_sfm.colmap.mapping import MappingTask, map_images
 from hm_sfm.colmap.overlays import Overlays, find_overlays
 from hm_sfm.colmap.verification import VerifiedPair, rank_pairs, verify_database, verify_pairs
 from hm_sfm.config import Config
+from hm_sfm.judgement.judgement import Judgement, judge_pairs
 from hm_sfm.keypoints.graph import Photo
 from hm_sfm.keypoints.persistence import persist_keypoints
 from hm_sfm.keypoints.refinement import KeypointRefiner
@@ -102,7 +103,7 @@ class Run:
 
         seeds: as in seed_photos. Raises InputError on an undecodable photo.
         """
-        verified = self._verify()
+        verified = self._judge(self._verify()).pairs
         with self.timings.measure("keypoints"):
             return persist_keypoints(
                 seed_photos(self.images, self.config, self.collection.masks, seeds, self.quiet),
@@ -114,13 +115,22 @@ class Run:
             )
 
     def _verify(self) -> dict[ImagePair, VerifiedPair]:
-        cameras = self.collection.cameras
-        camera_of = {image.name: cameras.cameras[i] for image, i in zip(self.images, cameras.camera_index, strict=True)}
         px_scales = measure_px_scales(self.images, self.config)
         with self.timings.measure("verify"):
             return verify_pairs(
-                self.images, self.pairs, self.read, camera_of, px_scales, self.config.verification, self.quiet
+                self.images, self.pairs, self.read, self._camera_of(), px_scales, self.config.verification, self.quiet
             )
+
+    def _judge(self, verified: dict[ImagePair, VerifiedPair]) -> Judgement:
+        if not self.config.verification.judge:
+            return Judgement(verified, (), 0)
+        px_scales = measure_px_scales(self.images, self.config)
+        with self.timings.measure("verify"):
+            return judge_pairs(verified, self.read, self._camera_of(), px_scales, self.config.verification, self.quiet)
+
+    def _camera_of(self) -> dict[str, pycolmap.Camera]:
+        cameras = self.collection.cameras
+        return {image.name: cameras.cameras[i] for image, i in zip(self.images, cameras.camera_index, strict=True)}
 
     def write_database(self, keypoints: Sequence[Keypoints], matches: Sequence[IndexMatches]) -> Path:
         """OUT/database.db, see write_verified; its path."""

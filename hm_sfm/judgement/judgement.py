@@ -31,10 +31,9 @@ UNSEEN = 5
 class GivenUpPair:
     """A verified pair that loops through other photos contradict."""
 
-    pair: ImagePair
+    verified: VerifiedPair
     belief: float
     """In [0, 1], higher is better: how far the pair was believed."""
-    inliers: int
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ def judge_pairs(
         judged[pairs[i]] = replace(checked, inliers=agreeing, strength=checked.strength * np.mean(~refuted))
     lost = np.flatnonzero(~kept)
     lost = lost[np.argsort(belief[lost], kind="stable")]
-    given_up = tuple(GivenUpPair(pairs[i], float(belief[i]), int(inliers[i])) for i in lost)
+    given_up = tuple(GivenUpPair(verified[pairs[i]], float(belief[i])) for i in lost.tolist())
     return Judgement(judged, given_up, denied)
 
 

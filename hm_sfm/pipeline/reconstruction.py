@@ -75,7 +75,7 @@ def merge_matches(image_folder: Path, out: Path, config: Config) -> int:
 def export_database(image_folder: Path, out: Path, config: Config, quiet: bool = False) -> Run:
     """As match_photos, then OUT/database.db with persistent keypoints and verified matches."""
     run = match_photos(image_folder, out, config, quiet)
-    run.write_database(*run.make_keypoints())
+    run.write_database(*run.make_keypoints(run.verify().pairs))
     return run
 
 
@@ -86,7 +86,7 @@ def export_hloc(image_folder: Path, out: Path, config: Config, quiet: bool = Fal
     The pairs are those of OUT/pairs.txt. Raises InputError where image names differ in "/" and "-" only.
     """
     run = match_photos(image_folder, out, config, quiet)
-    keypoints, matches = run.make_keypoints()
+    keypoints, matches = run.make_keypoints(run.verify().pairs)
     folder = run.out / "hloc"
     write_features(folder / "features.h5", run.images, keypoints, measure_px_scales(run.images, config))
     write_matches(folder / "matches.h5", run.pairs, keypoints, matches)
@@ -105,12 +105,13 @@ def reconstruct(image_folder: Path, out: Path, config: Config, quiet: bool = Fal
 
 def build_model(run: Run) -> MappingResult:
     """What reconstruct does after its pairs are matched. Raises NoModelError as reconstruct does."""
-    database = run.write_database(*run.make_keypoints())
+    judgement = run.verify()
+    database = run.write_database(*run.make_keypoints(judgement.pairs))
     models = run.map()
     result = summarise_models(models, len(run.images))
     diagnoses = diagnose(run.images, run.collection.cameras, run.pairs, run.read, database, models, run.config)
-    write_summary(run, result, diagnoses)
-    report = gather_report(run.out, run.images, len(run.pairs), models, diagnoses, run.config)
+    write_summary(run, result, judgement, diagnoses)
+    report = gather_report(run.out, run.images, len(run.pairs), models, judgement, run.read, diagnoses, run.config)
     write_report(run.out / "report.html", report)
     for diagnosis in diagnoses:
         logger.warning("%s", diagnosis)

@@ -78,7 +78,7 @@ def refine_database(
     check_coarse(matching, collection.pairs)
     run = Run(collection, out, config, load_matcher(config), timings=timings, quiet=quiet)
     run.match()
-    return run, run.write_database(*run.make_keypoints(rank_keypoints(content)))
+    return run, run.write_database(*run.make_keypoints(run.verify().pairs, rank_keypoints(content)))
 
 
 def read_database(path: Path, image_folder: Path) -> DatabaseContent:

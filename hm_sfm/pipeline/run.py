@@ -96,14 +96,25 @@ class Run:
             self.images, self.pairs, self._read_unmasked, px_scales, self.config.verification.min_score
         )
 
+    def verify(self) -> Judgement:
+        """The pairs that a two-view geometry and, where the configuration asks for it, other photos agree with."""
+        cameras = self.collection.cameras
+        camera_of = {image.name: cameras.cameras[i] for image, i in zip(self.images, cameras.camera_index, strict=True)}
+        px_scales, config = measure_px_scales(self.images, self.config), self.config.verification
+        with self.timings.measure("verify"):
+            verified = verify_pairs(self.images, self.pairs, self.read, camera_of, px_scales, config, self.quiet)
+        if not config.judge:
+            return Judgement(verified, (), 0)
+        with self.timings.measure("judge"):
+            return judge_pairs(verified, self.read, camera_of, px_scales, config, self.quiet)
+
     def make_keypoints(
-        self, seeds: Mapping[str, np.ndarray] | None = None
+        self, verified: Mapping[ImagePair, VerifiedPair], seeds: Mapping[str, np.ndarray] | None = None
     ) -> tuple[tuple[Keypoints, ...], tuple[IndexMatches, ...]]:
         """Persistent keypoints of all photos, and the matches of the pairs that share tracks, from verified matches.
 
         seeds: as in seed_photos. Raises InputError on an undecodable photo.
         """
-        verified = self._judge(self._verify()).pairs
         with self.timings.measure("keypoints"):
             return persist_keypoints(
                 seed_photos(self.images, self.config, self.collection.masks, seeds, self.quiet),
@@ -113,24 +124,6 @@ class Run:
                 make_refiner(self.matcher, self.images, self.config, self.store),
                 self.quiet,
             )
-
-    def _verify(self) -> dict[ImagePair, VerifiedPair]:
-        px_scales = measure_px_scales(self.images, self.config)
-        with self.timings.measure("verify"):
-            return verify_pairs(
-                self.images, self.pairs, self.read, self._camera_of(), px_scales, self.config.verification, self.quiet
-            )
-
-    def _judge(self, verified: dict[ImagePair, VerifiedPair]) -> Judgement:
-        if not self.config.verification.judge:
-            return Judgement(verified, (), 0)
-        px_scales = measure_px_scales(self.images, self.config)
-        with self.timings.measure("verify"):
-            return judge_pairs(verified, self.read, self._camera_of(), px_scales, self.config.verification, self.quiet)
-
-    def _camera_of(self) -> dict[str, pycolmap.Camera]:
-        cameras = self.collection.cameras
-        return {image.name: cameras.cameras[i] for image, i in zip(self.images, cameras.camera_index, strict=True)}
 
     def write_database(self, keypoints: Sequence[Keypoints], matches: Sequence[IndexMatches]) -> Path:
         """OUT/database.db, see write_verified; its path."""

@@ -8,12 +8,13 @@ from pathlib import Path
 
 from hm_sfm.config import fingerprint
 from hm_sfm.io.atomic import replace_file
+from hm_sfm.judgement.judgement import Judgement
 from hm_sfm.pipeline.run import Run
 from hm_sfm.report.diagnosis import Diagnosis
 from hm_sfm.types import MappingResult
 
 
-def write_summary(run: Run, result: MappingResult, diagnoses: Sequence[Diagnosis]) -> None:
+def write_summary(run: Run, result: MappingResult, judgement: Judgement, diagnoses: Sequence[Diagnosis]) -> None:
     """OUT/summary.json, atomically."""
     seconds = run.timings.seconds | {"total": run.timings.total}
     masks = dataclasses.asdict(run.config.masks)
@@ -28,6 +29,8 @@ def write_summary(run: Run, result: MappingResult, diagnoses: Sequence[Diagnosis
             for diagnosis in diagnoses
             for name, reason in diagnosis.reasons.items()
         },
+        "pairs_given_up": len(judgement.given_up),
+        "matches_denied": judgement.denied_matches,
         "models": len(result.models),
         "points": result.points,
         "observations": result.observations,

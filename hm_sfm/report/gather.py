@@ -1,7 +1,7 @@
 """What a report shows, gathered from a finished run: metrics per image, points and cameras of the model, weak pairs."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,12 @@ import pycolmap
 from hm_sfm.colmap.database import open_database, read_verified_matches
 from hm_sfm.colmap.models import list_observations
 from hm_sfm.config import Config, fingerprint
+from hm_sfm.judgement.judgement import Judgement
 from hm_sfm.keypoints.tracks import build_tracks, count_neighbours
 from hm_sfm.photos.images import prepare_image
 from hm_sfm.report.diagnosis import Diagnosis
 from hm_sfm.report.drawn_matches import draw_photo_matches
-from hm_sfm.types import ImagePair, ImageRef, freeze_array
+from hm_sfm.types import ImagePair, ImageRef, PairMatches, freeze_array
 
 MOST_POINTS = 100_000
 """Shown of a model; 2 MB of the page."""
@@ -82,6 +83,18 @@ class WeakPair:
     the photos is not registered."""
 
 
+@dataclass(frozen=True)
+class RefutedPair:
+    """A verified pair that loops through other photos contradict, see hm_sfm.judgement."""
+
+    pair: ImagePair
+    matches: int
+    belief: float
+    """In [0, 1], higher is better."""
+    jpeg: bytes
+    """Both photos with the matches drawn; empty for all but those with the most matches."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Report:
     """Everything that the page shows."""
@@ -99,6 +112,8 @@ class Report:
     track_lengths: Mapping[str, Mapping[int, int]]
     """Method -> track length -> number of points; this run's first."""
     weak_pairs: tuple[WeakPair, ...]
+    refuted_pairs: tuple[RefutedPair, ...]
+    """Those with the most matches first."""
     diagnoses: tuple[Diagnosis, ...]
     config: Config
 
@@ -108,13 +123,15 @@ def gather_report(
     images: Sequence[ImageRef],
     num_pairs: int,
     models: Sequence[pycolmap.Reconstruction],
+    judgement: Judgement,
+    read: Callable[[ImagePair], PairMatches],
     diagnoses: Sequence[Diagnosis],
     config: Config,
 ) -> Report:
     """The report of the run in OUT, from its summary.json and database.db; compare.json where it fits this run.
 
-    models: the largest first, of any number. Raises InputError where there is no database, or where a photo of a weak
-    pair cannot be read.
+    models: the largest first, of any number. read: all matches of a pair. Raises InputError where there is no database,
+    or where a photo of a pair that is drawn cannot be read.
     """
     out = Path(out)
     summary = json.loads((out / "summary.json").read_text())
@@ -136,6 +153,7 @@ def gather_report(
         scene=lay_out_scene(model, {ref.name: _turn_to_upright(ref) for ref in images}) if models else None,
         track_lengths={"this run": this_run, **read_baselines(out / "compare.json", len(images), config)},
         weak_pairs=draw_weak_pairs({ref.name: ref for ref in images}, model, verified, keypoints),
+        refuted_pairs=draw_refuted_pairs({ref.name: ref for ref in images}, model, judgement, read),
         diagnoses=tuple(diagnoses),
         config=config,
     )
@@ -275,16 +293,49 @@ def draw_weak_pairs(
     posed = {model.image(image_id).name: model.image(image_id) for image_id in model.reg_image_ids()}
     drawn = []
     for pair, rows in sorted(verified.items(), key=lambda item: (len(item[1]), item[0]))[:MOST_WEAK_PAIRS]:
-        chosen = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), WEAK_PAIR_LINES)).round().astype(int))]
-        xy0, xy1 = keypoints[pair.name0][chosen[:, 0]], keypoints[pair.name1][chosen[:, 1]]
-        error_px = np.full(len(chosen), np.nan)
-        if pair.name0 in posed and pair.name1 in posed:
-            error_px = measure_epipolar_px(model, posed[pair.name0], posed[pair.name1], xy0, xy1)
-        photo0, photo1 = (prepare_image(images[name], WEAK_PAIR_EDGE_PX) for name in (pair.name0, pair.name1))
-        picture = draw_photo_matches(photo0, photo1, xy0, xy1, error_px, caption="")
-        _, code = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        drawn.append(WeakPair(pair, len(rows), code.tobytes()))
+        xy0, xy1 = keypoints[pair.name0][rows[:, 0]], keypoints[pair.name1][rows[:, 1]]
+        drawn.append(WeakPair(pair, len(rows), draw_pair(images, model, posed, pair, xy0, xy1)))
     return tuple(drawn)
+
+
+def draw_refuted_pairs(
+    images: Mapping[str, ImageRef],
+    model: pycolmap.Reconstruction,
+    judgement: Judgement,
+    read: Callable[[ImagePair], PairMatches],
+) -> tuple[RefutedPair, ...]:
+    """The pairs that were given up, those with the most matches first. Raises InputError as draw_weak_pairs does."""
+    posed = {model.image(image_id).name: model.image(image_id) for image_id in model.reg_image_ids()}
+    drawn = []
+    for number, lost in enumerate(
+        sorted(judgement.given_up, key=lambda lost: (-np.count_nonzero(lost.verified.inliers), lost.verified.pair))
+    ):
+        pair, jpeg = lost.verified.pair, b""
+        if number < MOST_WEAK_PAIRS:
+            matches = read(pair).select(lost.verified.inliers)
+            jpeg = draw_pair(images, model, posed, pair, matches.xy0.astype(np.float64), matches.xy1.astype(np.float64))
+        drawn.append(RefutedPair(pair, int(np.count_nonzero(lost.verified.inliers)), lost.belief, jpeg))
+    return tuple(drawn)
+
+
+def draw_pair(
+    images: Mapping[str, ImageRef],
+    model: pycolmap.Reconstruction,
+    posed: Mapping[str, pycolmap.Image],
+    pair: ImagePair,
+    xy0: np.ndarray,
+    xy1: np.ndarray,
+) -> bytes:
+    """The JPEG of two photos and some of their matches (M, 2) px, coloured by their errors in the model."""
+    chosen = np.unique(np.linspace(0, len(xy0) - 1, min(len(xy0), WEAK_PAIR_LINES)).round().astype(int))
+    xy0, xy1 = xy0[chosen], xy1[chosen]
+    error_px = np.full(len(chosen), np.nan)
+    if pair.name0 in posed and pair.name1 in posed:
+        error_px = measure_epipolar_px(model, posed[pair.name0], posed[pair.name1], xy0, xy1)
+    photo0, photo1 = (prepare_image(images[name], WEAK_PAIR_EDGE_PX) for name in (pair.name0, pair.name1))
+    picture = draw_photo_matches(photo0, photo1, xy0, xy1, error_px, caption="")
+    _, code = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return code.tobytes()
 
 
 def measure_epipolar_px(

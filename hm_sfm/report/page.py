@@ -13,7 +13,8 @@ import numpy as np
 import yaml
 
 from hm_sfm.io.atomic import replace_file
-from hm_sfm.report.gather import ImageMetrics, Report, Scene, WeakPair
+from hm_sfm.report.gather import ImageMetrics, RefutedPair, Report, Scene, WeakPair
+from hm_sfm.types import ImagePair
 
 MOST_PAIRS = 4000
 """Strongest verified pairs that the graph draws."""
@@ -30,6 +31,7 @@ STAGES = {
     "match": "matching",
     "keypoints": "keypoints and tracks",
     "verify": "verification",
+    "judge": "judgement of pairs",
     "map": "mapping",
 }
 
@@ -58,6 +60,7 @@ def render_page(report: Report) -> str:
         track_lengths=render_track_lengths(report.track_lengths),
         graph=render_graph(report.images, report.verified_pairs),
         weak_pairs=render_weak_pairs(report.weak_pairs),
+        refuted_pairs=render_refuted_pairs(report.refuted_pairs),
         timings=render_timings(summary["seconds"]),
         config=escape(yaml.safe_dump(dataclasses.asdict(report.config), sort_keys=False)),
     )
@@ -73,6 +76,8 @@ def render_tiles(report: Report) -> str:
         (f"{summary['mean_reprojection_px']:.3f} px", "reprojection error"),
         (f"{len(report.verified_pairs):,} / {report.num_pairs:,}", "pairs verified"),
     ]
+    if report.refuted_pairs:
+        tiles.append((f"{len(report.refuted_pairs):,}", "pairs given up"))
     if summary["models"] > 1:
         tiles.append((str(summary["models"]), "models"))
     if summary["skipped_images"]:
@@ -241,15 +246,40 @@ def render_weak_pairs(weak_pairs: Sequence[WeakPair]) -> str:
     """Pictures of the weakest pairs."""
     if not weak_pairs:
         return "<p>No pair was verified.</p>"
-    figures = []
-    for weak in weak_pairs:
-        names = f"{escape(weak.pair.name0)} &ndash; {escape(weak.pair.name1)}"
-        picture = f"data:image/jpeg;base64,{base64.b64encode(weak.jpeg).decode()}"
-        figures.append(
-            f'<figure><img src="{picture}" alt="matches of {names}" loading="lazy">'
-            f"<figcaption>{names}: {weak.matches:,} matches</figcaption></figure>"
-        )
-    return "".join(figures)
+    return "".join(render_pair(weak.pair, weak.jpeg, f"{weak.matches:,} matches") for weak in weak_pairs)
+
+
+def render_refuted_pairs(refuted_pairs: Sequence[RefutedPair]) -> str:
+    """The section of the pairs that were given up; nothing where there are none."""
+    if not refuted_pairs:
+        return ""
+    texts = [f"{refuted.matches:,} matches, believed to {100 * refuted.belief:.0f} %" for refuted in refuted_pairs]
+    shown = "".join(
+        render_pair(refuted.pair, refuted.jpeg, text) for refuted, text in zip(refuted_pairs, texts) if refuted.jpeg
+    )
+    others = "".join(
+        f"<li>{name_pair(refuted.pair)}: {text}</li>" for refuted, text in zip(refuted_pairs, texts) if not refuted.jpeg
+    )
+    rest = f"<details><summary>All others</summary><ul>{others}</ul></details>" if others else ""
+    return f"""<section id="refuted"><h2>Pairs given up</h2>
+<p class="note">Their matches agree with each other, but not with those of other photos: going from photo to photo in a
+circle does not lead back to where it began. Mostly they show two places that look alike, such as the windows of two
+facades. Those with the most matches:</p>
+<div class="pairs">{shown}</div>{rest}</section>"""
+
+
+def render_pair(pair: ImagePair, jpeg: bytes, text: str) -> str:
+    """A picture of a pair's matches, with its names and `text` below."""
+    picture = f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}"
+    return (
+        f'<figure><img src="{picture}" alt="matches of {name_pair(pair)}" loading="lazy">'
+        f"<figcaption>{name_pair(pair)}: {text}</figcaption></figure>"
+    )
+
+
+def name_pair(pair: ImagePair) -> str:
+    """Both names, as HTML."""
+    return f"{escape(pair.name0)} &ndash; {escape(pair.name1)}"
 
 
 def render_timings(seconds: Mapping[str, float]) -> str:

@@ -35,7 +35,7 @@ def run_hloc_style_steps(photos: Path, out: Path) -> None:
     write_pairs(hloc / "pairs.txt", run.pairs)
 
     # 2. Features: the keypoints that persist from image to image.
-    keypoints, matches = run.make_keypoints()
+    keypoints, matches = run.make_keypoints(run.verify().pairs)
     px_scale = measure_px_scales(run.images, config)
     write_features(hloc / "features.h5", run.images, keypoints, px_scale)
 

@@ -9,7 +9,9 @@ import numpy as np
 import pycolmap
 import pytest
 
+from hm_sfm.colmap.verification import VerifiedPair
 from hm_sfm.config import Config, fingerprint
+from hm_sfm.judgement.judgement import GivenUpPair, Judgement
 from hm_sfm.keypoints.tracks import build_tracks, count_neighbours
 from hm_sfm.report.diagnosis import Cause, Diagnosis
 from hm_sfm.report.gather import (
@@ -19,7 +21,9 @@ from hm_sfm.report.gather import (
     make_upright,
     read_baselines,
 )
-from hm_sfm.types import ImageRef
+from hm_sfm.types import ImagePair, ImageRef, PairMatches
+
+NOTHING_REFUTED = Judgement({}, (), 0)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +56,7 @@ def run(tmp_path_factory) -> tuple[Path, list[ImageRef], pycolmap.Reconstruction
 def report(run):
     out, images, model = run
     diagnosis = Diagnosis(Cause.NO_POSE, {images[4].name: "why"}, ())
-    return gather_report(out, images, 10, [model], [diagnosis], Config())
+    return gather_report(out, images, 10, [model], NOTHING_REFUTED, None, [diagnosis], Config())
 
 
 def test_figures_of_images_are_those_of_the_model(run, report):
@@ -147,11 +151,28 @@ def test_neighbours_share_a_track():
 
 def test_no_model(run):
     out, images, _ = run
-    report = gather_report(out, images, 10, [], [], Config())
+    report = gather_report(out, images, 10, [], NOTHING_REFUTED, None, [], Config())
     assert report.scene is None
     assert report.track_lengths == {"this run": {}}
     assert not any(image.registered for image in report.images)
     assert len(report.weak_pairs) == MOST_WEAK_PAIRS
+
+
+def test_pairs_given_up_are_drawn_those_with_most_matches_first(run):
+    out, images, model = run
+    names = [image.name for image in images]
+    stored, given_up = {}, []
+    for number, pair in enumerate(ImagePair(*names[i : i + 2]) for i in range(4)):
+        xy = np.random.default_rng(number).uniform(10, 90, (5, 2))
+        homography = np.tile(np.eye(3), (5, 1, 1))
+        stored[pair] = PairMatches(
+            pair=pair, xy0=xy, xy1=xy, score=np.ones(5), homography=homography, patch_radius_px=8.0
+        )
+        given_up.append(GivenUpPair(VerifiedPair(pair, np.arange(5) <= number, 1.0), 0.1 * number))
+    report = gather_report(out, images, 10, [model], Judgement({}, tuple(given_up), 0), stored.get, [], Config())
+    assert [refuted.matches for refuted in report.refuted_pairs] == [4, 3, 2, 1]
+    assert [refuted.belief for refuted in report.refuted_pairs] == pytest.approx([0.3, 0.2, 0.1, 0.0])
+    assert all(cv2.imdecode(np.frombuffer(each.jpeg, np.uint8), 0) is not None for each in report.refuted_pairs)
 
 
 def test_baselines_are_those_of_the_same_run(tmp_path):

@@ -87,6 +87,8 @@ def test_demo_leaves_the_files_that_other_programs_rely_on(demo, read_matches):
         "registered",
         "unregistered",
         "models",
+        "pairs_given_up",
+        "matches_denied",
         "points",
         "observations",
         "mean_track_length",
@@ -95,7 +97,7 @@ def test_demo_leaves_the_files_that_other_programs_rely_on(demo, read_matches):
         "version",
         "config_fingerprint",
     }
-    stages = {"features", "match", "keypoints", "verify", "map", "total"}
+    stages = {"features", "match", "keypoints", "verify", "judge", "map", "total"}
     assert summary["seconds"].keys() == stages
     assert all(summary["seconds"][stage] > 0 for stage in stages)
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from hm_sfm.config import Config
-from hm_sfm.report.gather import ImageMetrics, Report, Scene, WeakPair
+from hm_sfm.report.gather import ImageMetrics, RefutedPair, Report, Scene, WeakPair
 from hm_sfm.report.page import render_page
 from hm_sfm.types import ImagePair
 
@@ -132,6 +132,7 @@ def large_report() -> Report:
         scene=Scene(xyz, rng.integers(0, 255, (100_000, 3)), frusta, tuple(image.name for image in images)),
         track_lengths={"this run": {n: 1000 // n for n in range(2, 60)}},
         weak_pairs=(weak,) * 8,
+        refuted_pairs=(RefutedPair(ImagePair("a", "b"), 30, 0.1, code.tobytes()),) * 8,
         diagnoses=(),
         config=Config(),
     )

@@ -11,7 +11,7 @@ import pytest
 
 from hm_sfm.config import Config
 from hm_sfm.report.diagnosis import Cause, Diagnosis
-from hm_sfm.report.gather import ImageMetrics, Report, Scene, WeakPair
+from hm_sfm.report.gather import ImageMetrics, RefutedPair, Report, Scene, WeakPair
 from hm_sfm.report.page import LABEL_LENGTH, MOST_PAIRS, render_page, write_report
 from hm_sfm.types import ImagePair
 
@@ -70,6 +70,10 @@ def make_report(names=("a.jpg", "b.jpg", "c.jpg")) -> Report:
         scene=Scene(rng.normal(size=(50, 3)), rng.integers(0, 255, (50, 3)), rng.normal(size=(2, 5, 3)), names[:2]),
         track_lengths={"this run": {2: 100, 4: 300}, "loftr_style_raw": {2: 50, 3: 50}},
         weak_pairs=(WeakPair(ImagePair(*sorted(names[:2])), 400, b"jpeg"),),
+        refuted_pairs=(
+            RefutedPair(ImagePair("a", "c"), 77, 0.25, b"refuted"),
+            RefutedPair(ImagePair("<b>", "c"), 55, 0.125, b""),
+        ),
         diagnoses=(Diagnosis(Cause.FEW_MATCHES, reasons, ("--pairs exhaustive",)),),
         config=Config(),
     )
@@ -93,6 +97,14 @@ def test_every_section_shows_its_figures():
     assert re.search(r"matching\s*6\.0 s", text) and re.search(r"everything else\s*0\.5 s", text)
     assert "long_edge_px: 1024" in text
     assert "largest of 2 models" in text
+
+
+def test_pairs_that_were_given_up_are_shown_or_named():
+    page = render_page(make_report())
+    text = parse(page).text
+    assert re.search(r"2\s*pairs given up", text)
+    assert "a – c: 77 matches, believed to 25 %" in text and "<b> – c: 55 matches, believed to 12 %" in text
+    assert page.count(base64.b64encode(b"refuted").decode()) == 1
 
 
 def test_data_of_the_view_comes_back_bit_for_bit():
@@ -130,12 +142,19 @@ def test_without_a_model_the_page_says_so():
     report = make_report()
     images = [dataclasses.replace(image, registered=False, mean_error_px=None) for image in report.images]
     summary = {**report.summary, "registered": 0, "models": 0, "points": 0}
-    nothing = {"verified_pairs": {}, "scene": None, "track_lengths": {"this run": {}}, "weak_pairs": ()}
+    nothing = {
+        "verified_pairs": {},
+        "scene": None,
+        "track_lengths": {"this run": {}},
+        "weak_pairs": (),
+        "refuted_pairs": (),
+    }
     empty = dataclasses.replace(report, summary=summary, images=tuple(images), **nothing)
     text = parse(render_page(empty)).text
     for phrase in ("There is no model", "There are no tracks", "No pair was verified", "0 verified pairs"):
         assert phrase in text
     assert "<canvas" not in render_page(empty)
+    assert "given up" not in text
 
 
 def test_baseline_alone_has_tracks():

@@ -102,7 +102,7 @@ def judge_pairs(
         checked = verified[pairs[i]]
         heard = votes[i].votes[trusted[votes[i].triangle]]
         refuted = heard.sum(axis=0, dtype=np.int64) < 0
-        denied += np.count_nonzero(refuted)
+        denied += int(np.count_nonzero(refuted))
         inlier = np.flatnonzero(checked.inliers)
         agreeing = checked.inliers.copy()
         agreeing[inlier[refuted]] = False

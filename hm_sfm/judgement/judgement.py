@@ -21,6 +21,8 @@ from hm_sfm.types import ImagePair, PairMatches
 
 MOST_LOOPS = 10
 """Loops of matches per pair, the strongest ones: the time of all grows with the number of pairs alone."""
+CONFIRMED = 0.6
+"""Share of its matches that loops through believed pairs must confirm for a doubted pair to stay, with these alone."""
 HELD_PAIRS = 1000
 """Pairs whose matches stay in memory."""
 UNSEEN = 5
@@ -96,17 +98,20 @@ def judge_pairs(
     belief, against = weigh_pairs(inliers, triangles, closed)
     kept = choose_believed(ends, belief, against)
 
+    believed = kept[triangles.pairs]
     judged, denied = {}, 0
-    trusted = kept[triangles.pairs].all(axis=1)
-    for i in np.flatnonzero(kept).tolist():
-        checked = verified[pairs[i]]
-        heard = votes[i].votes[trusted[votes[i].triangle]]
-        refuted = heard.sum(axis=0, dtype=np.int64) < 0
-        denied += int(np.count_nonzero(refuted))
-        inlier = np.flatnonzero(checked.inliers)
-        agreeing = checked.inliers.copy()
-        agreeing[inlier[refuted]] = False
-        judged[pairs[i]] = replace(checked, inliers=agreeing, strength=checked.strength * np.mean(~refuted))
+    for i, pair in enumerate(pairs):
+        # Loops are heard if the two other pairs are believed.
+        trusted = (believed | (triangles.pairs == i)).all(axis=1)
+        heard = votes[i].votes[trusted[votes[i].triangle]].sum(axis=0, dtype=np.int64)
+        agreed = heard >= 0 if kept[i] else heard > 0
+        kept[i] |= np.count_nonzero(agreed) >= max(config.min_inliers, CONFIRMED * len(agreed))
+        if kept[i]:
+            inliers_of_pair = verified[pair].inliers.copy()
+            inliers_of_pair[np.flatnonzero(inliers_of_pair)[~agreed]] = False
+            strength = verified[pair].strength * float(np.mean(agreed))
+            judged[pair] = VerifiedPair(pair, inliers_of_pair, strength)
+            denied += int(np.count_nonzero(~agreed))
     lost = np.flatnonzero(~kept)
     lost = lost[np.argsort(belief[lost], kind="stable")]
     given_up = tuple(GivenUpPair(verified[pairs[i]], float(belief[i])) for i in lost.tolist())

@@ -4,7 +4,7 @@ Two photos cannot tell a facade from its twin, nor refute a match that lies on t
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np

@@ -1,5 +1,6 @@
 """The demo's scene: a courtyard of textured boxes, photographed by known cameras. World units are metres, z is up."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -73,9 +74,7 @@ def make_demo_scene(seed: int = 0) -> tuple[Quad, ...]:
 
 def make_demo_views(count: int = 12, size_wh: tuple[int, int] = (640, 480)) -> tuple[PinholeView, ...]:
     """Cameras of one K on an arc in front of the courtyard, at most 7.5 degrees apart, at differing heights."""
-    width, height = size_wh
-    focal_px = DEMO_FOCAL_35MM * np.hypot(width, height) / COLMAP_DIAGONAL_35MM
-    k = np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
+    k = make_intrinsics(size_wh)
     half_deg = min(7.5 * (count - 1), 82.5) / 2
     views = []
     for index, angle in enumerate(np.radians(np.linspace(-half_deg, half_deg, count))):
@@ -83,11 +82,18 @@ def make_demo_views(count: int = 12, size_wh: tuple[int, int] = (640, 480)) -> t
         radius, height_m = 7.6 + 0.5 * np.sin(2.4 * index), 1.9 + 0.55 * np.sin(1.7 * index + 1)
         center = np.array([radius * np.sin(angle), 1.2 - radius * np.cos(angle), height_m])
         target = np.array([0.5 * np.sin(1.1 * index), 1.2 + 0.4 * np.cos(2.0 * index), 0.95])
-        views.append(PinholeView(k, size_wh, _look_at(center, target, roll=np.radians(3 * np.sin(3.1 * index)))))
+        views.append(PinholeView(k, size_wh, aim_camera(center, target, roll=np.radians(3 * np.sin(3.1 * index)))))
     return tuple(views)
 
 
-def _look_at(center: np.ndarray, target: np.ndarray, roll: float) -> np.ndarray:
+def make_intrinsics(size_wh: tuple[int, int]) -> np.ndarray:
+    """(3, 3): the K of photos of this size that says what their EXIF does."""
+    width, height = size_wh
+    focal_px = DEMO_FOCAL_35MM * np.hypot(width, height) / COLMAP_DIAGONAL_35MM
+    return np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1]])
+
+
+def aim_camera(center: np.ndarray, target: np.ndarray, roll: float = 0.0) -> np.ndarray:
     """cam_from_world (3, 4) of a camera at `center` whose axis meets `target`, upright but for `roll` radians."""
     forward = (target - center) / np.linalg.norm(target - center)
     right = np.cross(forward, [0, 0, 1])
@@ -113,12 +119,17 @@ def write_demo(
 
     Returns image name -> the camera that it was rendered with. The same seed gives the same files.
     """
-    folder = Path(folder)
+    return write_photos(Path(folder), make_demo_scene(seed), make_demo_views(count, size_wh), seed)
+
+
+def write_photos(
+    folder: Path, quads: tuple[Quad, ...], views: Sequence[PinholeView], seed: int
+) -> dict[str, PinholeView]:
+    """Write the photos that `views` take of a scene and their cameras, as write_demo does; seed: of the noise."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    quads = make_demo_scene(seed)
-    views = {f"view_{index:02d}.jpg": view for index, view in enumerate(make_demo_views(count, size_wh))}
-    for index, (name, view) in enumerate(views.items()):
+    named = {f"view_{index:02d}.jpg": view for index, view in enumerate(views)}
+    for index, (name, view) in enumerate(named.items()):
         photo = expose_photo(render_view(quads, view).image, np.random.default_rng([seed, index]))
         write_jpeg(folder / "images" / name, photo, DEMO_FOCAL_35MM)
-    write_strecha_cameras(folder / "ground_truth", views)
-    return views
+    write_strecha_cameras(folder / "ground_truth", named)
+    return named

@@ -1,4 +1,4 @@
-"""Stage 4: persistent keypoints. The whole chain from verified patch matches to the keypoints of all images.
+"""Stage 5: persistent keypoints. The whole chain from verified patch matches to the keypoints of all images.
 
 Keypoints are propagated through the pairs, and the edges pruned to those that tracks will use. A refiner, where there
 is one, predicts these anew. Then the tracks are settled, and what is left of the edges are the matches.

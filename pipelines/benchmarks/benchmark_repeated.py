@@ -1,4 +1,4 @@
-"""Scenes that repeat themselves, rendered, with and without the judgement of pairs: do the models fold?
+"""Scenes that repeat themselves, rendered, with and without the judgement of pairs: and whether the models fold.
 
     python pipelines/benchmarks/benchmark_repeated.py --out out/repeated
 

@@ -69,7 +69,7 @@ def propagate_keypoints(
         transfers = make_transfers(matches, *(photos[i].px_scale for i in ends))
         if strength[ends[1]] > strength[ends[0]]:
             ends, transfers = (ends[1], ends[0]), (transfers[1], transfers[0])
-        edges += propagate_pair(*ends, transfers, photos, growing, seeds[ends[0]], config)
+        edges += propagate_pair(*ends, transfers, photos, growing, (seeds[ends[0]], seeds[ends[1]]), config)
     return KeypointGraph(tuple(photos), tuple(keypoints.xy for keypoints in growing), tuple(edges))
 
 
@@ -93,7 +93,7 @@ def choose_good(score: np.ndarray, min_score: float, at_least: int) -> np.ndarra
 
 def propagate_pair(
     first: int, second: int, transfers: tuple[PatchTransfer, PatchTransfer], photos: Sequence[Photo],
-    growing: list[GrowingKeypoints], seeds: np.ndarray, config: KeypointConfig,
+    growing: list[GrowingKeypoints], seeds: tuple[np.ndarray, np.ndarray], config: KeypointConfig,
 ) -> list[TrackEdges]:  # fmt: skip
     """Propagate the keypoints of `first` into `second` and those left over in `second` back, then start new ones.
 
@@ -111,10 +111,13 @@ def propagate_pair(
     back = propagate_points(there.xy[left], transfers[1], here.xy, free_here, photos[first], config)
     back_edges = TrackEdges(second, first, left[back.point], here.settle(back), back)
 
-    covered, _ = find_nearest(seeds, here.xy, config.seed_spacing_px)
-    fresh = seeds[covered < 0]
-    # A seed starts a keypoint in both images: one that it could join has a neighbour here, which was propagated back.
-    no_partner = np.zeros(len(there.xy), bool)
-    seeded = propagate_points(fresh, transfers[0], there.xy, no_partner, photos[second], config)
-    seed_edges = TrackEdges(first, second, here.append(fresh[seeded.point]), there.settle(seeded), seeded)
-    return [onward_edges, back_edges, seed_edges]
+    seeded_edges = []
+    for a, b, transfer, points in ((first, second, transfers[0], seeds[0]), (second, first, transfers[1], seeds[1])):
+        covered, _ = find_nearest(points, growing[a].xy, config.seed_spacing_px)
+        fresh = points[covered < 0]
+        # A seed starts a keypoint in both images: one that it could join has a neighbour here, which was propagated back.
+        no_partner = np.zeros(len(growing[b].xy), bool)
+        seeded = propagate_points(fresh, transfer, growing[b].xy, no_partner, photos[b], config)
+        source = growing[a].append(fresh[seeded.point])
+        seeded_edges.append(TrackEdges(a, b, source, growing[b].settle(seeded), seeded))
+    return [onward_edges, back_edges, *seeded_edges]

@@ -2,8 +2,8 @@
 
 Pairs are walked strongest first. In a pair, every keypoint of the first image that lies in a verified patch is
 propagated into the second image by that patch's homography. Every keypoint of the second image that is left over is
-propagated back by the inverse. Patches that hold no keypoint yet start one at a seed. A propagated point joins a
-keypoint that is already there, or starts a new one.
+propagated back by the inverse. Patches that hold no keypoint yet start one at a seed, of the first image and then of
+the second. A propagated point joins a keypoint that is already there, or starts a new one.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,7 +50,7 @@ def propagate_keypoints(
 ) -> KeypointGraph:
     """Start keypoints at seeds and propagate them through all pairs.
 
-    photos: in the order of the result. ranked_pairs: strongest first. Of a pair, keypoints start in the image that is
+    photos: in the order of the result. ranked_pairs: strongest first. Of a pair, keypoints start first in the image that is
     in more and stronger pairs. read_verified: the matches of a pair that agree with its two-view geometry.
     """
     index_of = {photo.name: i for i, photo in enumerate(photos)}
@@ -97,7 +97,7 @@ def propagate_pair(
 ) -> list[TrackEdges]:  # fmt: skip
     """Propagate the keypoints of `first` into `second` and those left over in `second` back, then start new ones.
 
-    Adds to the keypoints of both images in `growing`. seeds: (N, 2) of the first image, as place_seeds gives them.
+    Adds to the keypoints of both images in `growing`. seeds: of both images, (N, 2) each, as place_seeds gives them.
     """
     here, there = growing[first], growing[second]
 

@@ -209,7 +209,7 @@ def test_photos_without_seeds():
 
 def make_scene(names: str) -> tuple[list[Photo], list[PairMatches]]:
     """Views of a plane with exact patches, all pairs, no two images equally strong; `names` in order of the views."""
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng(3)  # without a distance that rounding moves across a threshold
     views = [np.eye(3)]
     for _ in names[1:]:
         angle = rng.uniform(-0.3, 0.3)
@@ -298,7 +298,7 @@ def test_the_same_input_gives_the_same_result(scene, persisted):
 
 
 def test_selection_takes_longer_tracks_and_spreads(scene, persisted):
-    most = 40
+    most = 200
     keypoints, _, tracks = persist(*scene, dataclasses.replace(CONFIG, max_keypoints=most))
     counts = [len(points) for points in keypoints.values()]
     assert max(counts) <= 2 * most and np.mean(counts) <= 1.3 * most and min(counts) >= most / 2

@@ -50,8 +50,8 @@ def propagate_keypoints(
 ) -> KeypointGraph:
     """Start keypoints at seeds and propagate them through all pairs.
 
-    photos: in the order of the result. ranked_pairs: strongest first. Of a pair, keypoints start first in the image that is
-    in more and stronger pairs. read_verified: the matches of a pair that agree with its two-view geometry.
+    photos: in the order of the result. ranked_pairs: strongest first. Of a pair, the image that is in more and
+    stronger pairs starts keypoints first. read_verified: the matches of a pair that agree with its two-view geometry.
     """
     index_of = {photo.name: i for i, photo in enumerate(photos)}
     growing = [GrowingKeypoints() for _ in photos]
@@ -115,7 +115,7 @@ def propagate_pair(
     for a, b, transfer, points in ((first, second, transfers[0], seeds[0]), (second, first, transfers[1], seeds[1])):
         covered, _ = find_nearest(points, growing[a].xy, config.seed_spacing_px)
         fresh = points[covered < 0]
-        # A seed starts a keypoint in both images: one that it could join has a neighbour here, which was propagated back.
+        # A seed starts a keypoint in both images: one that it could join has a neighbour here, which came from there.
         no_partner = np.zeros(len(growing[b].xy), bool)
         seeded = propagate_points(fresh, transfer, growing[b].xy, no_partner, photos[b], config)
         source = growing[a].append(fresh[seeded.point])

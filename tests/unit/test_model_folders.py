@@ -38,8 +38,8 @@ def count_images(sparse: Path) -> dict[str, int]:
 
 def test_models_replace_those_of_the_run_before(write):
     assert count_images(write(6, 4, 3)) == {"0": 6, "1": 4, "2": 3}
-    sparse = write(5)
-    assert count_images(sparse) == {"0": 5} and sorted(path.name for path in sparse.iterdir()) == [RECORD, "0"]
+    sparse = write(7)
+    assert count_images(sparse) == {"0": 7} and sorted(path.name for path in sparse.iterdir()) == [RECORD, "0"]
     assert count_latest(sparse) == 1
 
 
@@ -49,7 +49,7 @@ def test_without_models_the_earlier_ones_stay(write):
     write()
     assert count_images(sparse) == {"0": 6, "1": 4} and (sparse / "0" / "images.bin").read_bytes() == before
     assert count_latest(sparse) == 0
-    assert count_images(write(3)) == {"0": 3}  # they are still known as ours
+    assert count_images(write(7)) == {"0": 7}  # they are still known as ours
 
 
 def test_without_any_models_there_is_no_folder(write):
@@ -62,8 +62,8 @@ def test_what_others_wrote_beside_models_stays(write):
     make_model(2).write_binary(sparse / "aligned")
     for path in (sparse / "project.ini", sparse / "0" / "points.ply", sparse / "1" / "notes.txt"):
         path.write_text(path.name)
-    write(5)
-    assert count_images(sparse) == {"0": 5, "aligned": 2}
+    write(6)
+    assert count_images(sparse) == {"0": 6, "aligned": 2}
     for path in (sparse / "project.ini", sparse / "0" / "points.ply", sparse / "1" / "notes.txt"):
         assert path.read_text() == path.name
     assert [path.name for path in (sparse / "1").iterdir()] == ["notes.txt"]
@@ -77,16 +77,25 @@ def test_models_that_others_wrote_or_changed_are_kept(write, tmp_path, caplog):
     write(6, 4)
     assert count_images(sparse) == {"0": 6, "1": 4, "0_kept": 7}
     make_model(8).write_binary(sparse / "0")
-    write(5)
-    assert count_images(sparse) == {"0": 5, "0_kept": 7, "0_kept_2": 8}
+    write(6)
+    assert count_images(sparse) == {"0": 6, "0_kept": 7, "0_kept_2": 8}
     assert caplog.messages == [
         f"{sparse / '0'} was written or changed by something else: it is now {sparse / name}"
         for name in ("0_kept", "0_kept_2")
     ]
     (sparse / "1").mkdir()
     make_model(3).write_binary(sparse / "1")
-    write(5)
+    write(6)
     assert count_images(sparse)["1"] == 3  # no model takes its place
+
+
+def test_a_model_of_more_images_is_kept_until_there_is_a_better_one(write, caplog):
+    sparse = write(6, 4)
+    assert count_images(write(5, 3)) == {"0": 5, "0_kept": 6, "1": 3}
+    assert caplog.messages == [
+        f"the new model has 5 images, that of an earlier run, which is now {sparse / '0_kept'}, has 6"
+    ]
+    assert count_images(write(5)) == {"0": 5, "0_kept": 6} and len(caplog.messages) == 1
 
 
 @pytest.mark.parametrize("fail_at", range(8))
@@ -106,18 +115,18 @@ def test_killed_at_any_rename_there_is_a_whole_model(write, tmp_path, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(hm_sfm.colmap.model_folders.os, "replace", count_and_fail)
         with suppress(KeyboardInterrupt):  # as if killed: nobody cleans up
-            replace_models([make_model(5), make_model(3)], sparse, work_folder)
+            replace_models([make_model(7), make_model(3)], sparse, work_folder)
     restore_models(sparse, work_folder)
     shutil.rmtree(work_folder)
-    assert count_images(sparse)["0"] in (5, 6) and count_images(sparse)["1"] in (3, 4)
+    assert count_images(sparse)["0"] in (6, 7) and count_images(sparse)["1"] in (3, 4)
     assert (sparse / "0" / "points.ply").read_text() == "mine"
-    write(2)
-    assert count_images(sparse) == {"0": 2} and (sparse / "0" / "points.ply").read_text() == "mine"
+    write(8)
+    assert count_images(sparse) == {"0": 8} and (sparse / "0" / "points.ply").read_text() == "mine"
 
 
 def test_a_damaged_record_loses_nothing(write):
     sparse = write(6)
     (sparse / RECORD).write_text("{")
     assert count_latest(sparse) == 0
-    assert count_images(write(5)) == {"0": 5, "0_kept": 6}
+    assert count_images(write(6)) == {"0": 6, "0_kept": 6}
     assert json.loads((sparse / RECORD).read_text())["latest"] == 1

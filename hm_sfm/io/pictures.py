@@ -10,6 +10,8 @@ from PIL import Image
 
 SOFTWARE = 0x0131
 """Exif's number of the tag that names what made a picture."""
+MAX_EDGE_PX = 16_383
+"""Of a drawing; WebP holds no more."""
 DRAWN_BY_US = Image.Exif()
 DRAWN_BY_US[SOFTWARE] = "hm_sfm"
 
@@ -25,7 +27,12 @@ def encode_picture(pixels: np.ndarray, ending: str) -> bytes:
 
 
 def encode_drawing(pixels: np.ndarray, ending: str) -> bytes:
-    """As encode_picture, with EXIF that says that hm_sfm drew it."""
+    """As encode_picture, with EXIF that says that hm_sfm drew it; reduced where it is larger than WebP can be."""
+    height, width = pixels.shape[:2]
+    if max(height, width) > MAX_EDGE_PX:
+        scale = MAX_EDGE_PX / max(height, width)
+        reduced_wh = max(1, round(width * scale)), max(1, round(height * scale))
+        pixels = cv2.resize(pixels, reduced_wh, interpolation=cv2.INTER_AREA)
     file = io.BytesIO()
     kind = {".png": "PNG", ".webp": "WEBP"}.get(ending, "JPEG")
     Image.fromarray(pixels if pixels.ndim == 2 else pixels[:, :, ::-1]).save(file, kind, exif=DRAWN_BY_US, quality=95)

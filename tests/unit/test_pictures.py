@@ -59,6 +59,14 @@ def test_drawings_are_known_as_such_and_are_no_photos(tmp_path, ending, caplog):
     assert caplog.messages == [f"skipped: {listing.skipped[0][1]}"]
 
 
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".webp"])
+def test_drawings_of_strips_fit_into_any_file(ending):
+    picture = np.zeros((40, 25_000, 3), np.uint8)
+    picture[:, 12_500:] = 250
+    decoded = cv2.imdecode(np.frombuffer(encode_drawing(picture, ending), np.uint8), cv2.IMREAD_COLOR)
+    assert decoded.shape == (26, 16_383, 3) and decoded[:, :8000].max() < 20 and decoded[:, 8400:].min() > 230
+
+
 @pytest.mark.slow
 def test_pictures_are_encoded_whichever_module_comes_first():
     """In processes of their own. With pycolmap before all else, OpenCV's PNG encoder ends the process."""

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from hm_sfm.config import ImageConfig
 from hm_sfm.errors import InputError
+from hm_sfm.keypoints.seeds import find_seeds
 from hm_sfm.matching.matcher import HomoMatcher
 from hm_sfm.photos.images import prepare_array
 from hm_sfm.photos.sizes import check_size, find_scale, measure_px_scale
@@ -41,6 +42,11 @@ def test_panoramas_and_strips_keep_their_height(size_wh, matched_wh):
     corner = prepared.stored_from_scaled @ [*matched_wh, 1]
     np.testing.assert_allclose(corner, [*size_wh, 1], rtol=1e-12)
     assert measure_px_scale(size_wh, 1024) == pytest.approx(min(size_wh) / min(matched_wh), rel=0.01)
+
+
+def test_strips_have_seeds_of_keypoints():
+    noise = np.random.default_rng(0).integers(0, 255, (32, 4500), np.uint8)
+    assert len(find_seeds(prepare_array(noise, 1024))) > 1000
 
 
 @given(shorter=st.integers(32, 3000), aspect=st.floats(1, 1000), long_edge_px=st.integers(64, 4096))

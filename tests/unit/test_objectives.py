@@ -130,8 +130,8 @@ def test_matches_are_judged_by_where_the_truth_is(monkeypatch):
 
     monkeypatch.setattr(net.head, "forward", estimate)
     batch = {"b_from_a": moved, "surface": surface}
-    score, right = objectives.judge_matches(net, maps, batch, 0.5)
-    torch.testing.assert_close(score, 1 - torch.exp(-1 / (2 * log_scale[1:].exp())))
+    actual, right = objectives.judge_matches(net, maps, batch, 0.5)
+    torch.testing.assert_close(actual, log_scale[1:])
     # Two rows of eight that B does not show, of six cells each, and one row that is off.
     assert right.tolist() == [False] * 11 + [True] * 30 + [False] * 6
     nothing = objectives.judge_matches(net, maps, batch | {"surface": torch.full((1, 64, 64), -1)}, 0.5)

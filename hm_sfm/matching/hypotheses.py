@@ -33,7 +33,9 @@ LEAST_SUPPORT = 8
 LEAST_SHARE = 0.5
 """and at least this share of them, lie beside it in the other sketch, too."""
 ENOUGH_AGREEING = 40
-"""Where a rotation has so many agreeing matches, other angles and scales are not compared."""
+"""Where a rotation has so many agreeing matches, other scales are not compared."""
+SURE_AGREEING = 100
+"""Where a quarter turn has so many, other angles are not: of photos with black corners, wrong turns have up to 60."""
 LEAST_AGREEING = 30
 """Photos are matched again under a hypothesis with so many agreeing matches (different places have up to 16),"""
 LEAST_GAIN = 2.0
@@ -105,8 +107,8 @@ def choose_hypotheses(matcher: CellMatcher, sketch0: Sketch, sketch1: Sketch) ->
         return count_agreeing(place_cells(index0, cells0.shape[1]), place_cells(index1, cells1.shape[1]))
 
     counts = {hypotheses: count(*hypotheses) for hypotheses in ROTATIONS}
-    for others in (TILTS, SCALES):
-        if max(counts.values()) < ENOUGH_AGREEING:
+    for others, enough in ((TILTS, SURE_AGREEING), (SCALES, ENOUGH_AGREEING)):
+        if max(counts.values()) < enough:
             counts |= {hypotheses: count(*hypotheses) for hypotheses in others}
     best = max(counts, key=counts.__getitem__)
     needed = LEAST_AGREEING if best == UNCHANGED else max(LEAST_AGREEING, LEAST_GAIN * counts[UNCHANGED])

@@ -8,6 +8,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+import torch
 
 from hm_sfm.config import ImageConfig, MatchingConfig
 from hm_sfm.geometry.frames import flip_matrix, homography_to_pixel_index, pixel_index_from_px, rotation_matrix
@@ -288,6 +289,29 @@ def test_each_way_is_compared_once():
         hypothesis0.rotation_deg == 0 and 1 in (hypothesis0.downscale, hypothesis1.downscale)
         for hypothesis0, hypothesis1 in ways
     )
+
+
+class ToldSketch:
+    """A sketch whose cells say how many of them agree with those of another one that is rotated by so many degrees."""
+
+    downscale = 1.0
+
+    def __init__(self, agreeing: dict[int, int]) -> None:
+        self.agreeing = agreeing
+
+    def encode(self, hypothesis: Hypothesis, matcher: object) -> torch.Tensor:
+        count = self.agreeing.get(hypothesis.rotation_deg, 0) if hypothesis.downscale == 1 else 0
+        return torch.full((30, 30, 1), float(count))
+
+    def match(self, cells0: torch.Tensor, cells1: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        index = np.arange(int(max(cells0.max(), cells1.max())))
+        return index, index, np.ones(len(index))
+
+
+@pytest.mark.parametrize(("quarter", "chosen_deg"), [(60, 135), (150, 90)])
+def test_angles_between_the_quarter_turns_are_compared_unless_a_quarter_turn_is_sure(quarter, chosen_deg):
+    sketch = ToldSketch({90: quarter, 135: 200})
+    assert choose_hypotheses(sketch, ToldSketch({}), sketch) == (IDENTITY, Hypothesis(chosen_deg))
 
 
 def test_scales_of_sketches_are_scales_of_photos():

@@ -15,6 +15,7 @@ import pycolmap
 
 from hm_sfm.colmap.cameras import FOCAL_RATIOS, guess_focal_px
 from hm_sfm.colmap.database import copy_database, open_database
+from hm_sfm.io.colmap_log import quiet_colmap
 
 logger = logging.getLogger(__name__)
 
@@ -79,7 +80,9 @@ def estimate_focal_lengths(path: Path, split: bool = False) -> None:
         options = pycolmap.ViewGraphCalibrationOptions(
             random_seed=0, reestimate_relative_pose=False, min_focal_length_ratio=low, max_focal_length_ratio=high
         )
-        if not pycolmap.calibrate_view_graph(copy, options):
+        with quiet_colmap(pycolmap.logging.FATAL):
+            is_calibrated = pycolmap.calibrate_view_graph(copy, options)
+        if not is_calibrated:
             return
         with open_database(copy) as database:
             focal_px = {camera.camera_id: camera.mean_focal_length() for camera in database.read_all_cameras()}
@@ -104,7 +107,8 @@ def split_cameras(path: Path) -> None:
             kept.add(image.camera_id)
             row = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
             database.update_image(row)
-        pycolmap.apply_rig_config([], database)
+        with quiet_colmap(pycolmap.logging.FATAL):
+            pycolmap.apply_rig_config([], database)
 
 
 def correct_focal_lengths(path: Path) -> None:

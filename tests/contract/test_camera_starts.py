@@ -177,11 +177,12 @@ def test_a_wrong_focal_length_in_exif_is_corrected(tmp_path, attempts, caplog, f
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["given", "exif"])
-def test_runs_correct_exif_but_not_what_the_user_gave(tmp_path, known):
+def test_runs_correct_exif_but_not_what_the_user_gave(tmp_path, known, capfd):
     scene = make_street()
     cameras = Cameras((make_camera(0.5 * FOCAL_PX, True),), (0,) * len(scene.images), known=known)
     collection = Collection(tmp_path, scene.images, tuple(some.pair for some in scene.matches), cameras)
     run.write_verified(tmp_path / "database.db", collection, Config(), scene.keypoints, scene.matches)
+    assert capfd.readouterr().err == ""  # COLMAP says nothing
     (camera,) = read_cameras(tmp_path)
     assert camera.has_prior_focal_length == known
     assert camera.focal_length == pytest.approx((0.5 if known else 1.0) * FOCAL_PX, rel=0.05)
@@ -318,10 +319,12 @@ def test_lenses_that_do_not_exist(params, impossible):
     assert is_impossible(camera) == impossible
 
 
-def test_split_cameras_keep_intrinsics_and_images(tmp_path):
+def test_split_cameras_keep_intrinsics_and_images(tmp_path, capfd):
     scene = make_street()
     path, _ = write_verified(tmp_path, scene, make_camera(500.0, True))
+    capfd.readouterr()
     split_cameras(path)
+    assert capfd.readouterr().err == ""
     with open_database(path) as database:
         images, cameras = database.read_all_images(), database.read_all_cameras()
         assert sorted(image.camera_id for image in images) == sorted(camera.camera_id for camera in cameras)

@@ -1,5 +1,7 @@
 """Which photos look alike: descriptors from cells, the nearest ones, and the samples of cells on disk."""
 
+from pathlib import Path
+
 import cv2
 import h5py
 import numpy as np
@@ -51,7 +53,7 @@ class Ring:
             self.cells[f"{i:03d}.jpg"] = normalise(
                 np.concatenate([appearance[arc] + 0.05 * rng.normal(size=(seen, CHANNELS)), noise])
             )
-        self.images = [ImageRef(name, name, (640, 480)) for name in self.cells]
+        self.images = [ImageRef(name, Path(name), (640, 480)) for name in self.cells]
         self.digests = {name: f"{i:016x}" for i, name in enumerate(self.cells)}
         self.encoded: list[str] = []
         self.encoder = self

@@ -14,7 +14,9 @@ from hm_sfm.cli.terminal import stop_on_terminate
 
 def start(body: str, *arguments: str, **settings) -> subprocess.Popen[str]:
     """Start `hm-sfm demo OUT` with another body, given as the lines of a function of its options."""
-    code = "import logging, os, sys, time\nfrom tqdm import tqdm\nfrom hm_sfm.cli import commands, main\n"
+    code = "import logging, os, signal, sys, time\nfrom tqdm import tqdm\nfrom hm_sfm.cli import commands, main\n"
+    # A shell that starts the tests in the background has processes ignore Ctrl-C.
+    code += "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     code += "from hm_sfm.errors import InputError\n"
     code += f"def run_demo(options):\n{textwrap.indent(textwrap.dedent(body), '    ')}\n"
     code += "commands.run_demo = run_demo\nsys.exit(main(sys.argv[1:]))\n"

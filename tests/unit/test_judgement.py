@@ -60,7 +60,8 @@ def test_the_rotations_of_a_triangle_close_and_a_planted_error_is_what_is_missin
 def judge_planted(count: int, wrong: list[int], inliers: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Which pairs are kept where those of `wrong` have random rotations."""
     rotations = relate(Rotation.random(count, random_state=1).as_matrix(), ends)
-    rotations[wrong] = Rotation.random(len(wrong), random_state=2).as_matrix()
+    if wrong:
+        rotations[wrong] = Rotation.random(len(wrong), random_state=2).as_matrix()
     triangles = find_triangles(ends)
     closed = np.exp(-0.5 * (measure_rotation_loops(rotations, triangles) / 3) ** 2)
     return choose_believed(ends, *weigh_pairs(inliers, triangles, closed))

@@ -1,5 +1,6 @@
 """Structure from Motion from detector-free matches with homographies and persistent keypoints."""
 
+import zlib  # noqa: F401  before pycolmap 4.2.1, whose copy of it would be mixed with the system's: that crashes
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

@@ -1,11 +1,13 @@
 """Pictures as bytes of an image file; drawings are marked in it, so that they are never taken for photos."""
 
 import io
+import tempfile
 import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 from PIL import Image
 
 SOFTWARE = 0x0131
@@ -19,10 +21,12 @@ DRAWN_BY_US[SOFTWARE] = "hm_sfm"
 def encode_picture(pixels: np.ndarray, ending: str) -> bytes:
     """(H, W) grey or (H, W, 3) BGR uint8 as an image file of the kind of `ending`: .jpg, .jpeg, .png or .webp."""
     if ending == ".png":
-        # Not by OpenCV: where pycolmap was imported before it, as scripts may do, its PNG encoder ends the process.
-        file = io.BytesIO()
-        Image.fromarray(pixels if pixels.ndim == 2 else pixels[:, :, ::-1]).save(file, "PNG", compress_level=1)
-        return file.getvalue()
+        # Where pycolmap 4.2.1 was imported before all else, its copy of zlib is mixed with the system's: whatever else
+        # compresses, OpenCV and Pillow too, ends the process. Its own PNG writer is safe in any order.
+        with tempfile.TemporaryDirectory() as folder:
+            shown = pixels if pixels.ndim == 2 else pixels[:, :, ::-1]
+            pycolmap.Bitmap.from_array(np.ascontiguousarray(shown)).write(Path(folder) / "picture.png")
+            return (Path(folder) / "picture.png").read_bytes()
     return cv2.imencode(ending, pixels)[1].tobytes()
 
 

@@ -13,6 +13,7 @@ from hm_sfm.colmap.database import write_database
 from hm_sfm.colmap.mapping import MappingTask, map_incrementally, summarise_models
 from hm_sfm.colmap.verification import rank_pairs, verify_database, verify_pairs
 from hm_sfm.config import Config
+from hm_sfm.judgement.judgement import judge_pairs
 from hm_sfm.keypoints.persistence import persist_keypoints
 from hm_sfm.matching.run import match_pairs
 from hm_sfm.photos.images import list_images
@@ -39,6 +40,9 @@ def reconstruct_folder(photos: Path, out: Path) -> None:
     camera_of = {image.name: cameras.cameras[index] for image, index in zip(images, cameras.camera_index)}
     px_scale = measure_px_scales(images, config)
     verified = verify_pairs(images, pairs, store.read, camera_of, px_scale, config.verification)
+
+    # Third photos refute pairs of places that only look alike, and matches that two photos cannot.
+    verified = judge_pairs(verified, store.read, camera_of, px_scale, config.verification).pairs
 
     # Keypoints that persist from image to image, and their matches.
     keypoints, matches = persist_keypoints(

@@ -16,6 +16,7 @@ import pycolmap
 from PIL import Image
 
 from hm_sfm.errors import InputError
+from hm_sfm.io.pictures import encode_picture
 from hm_sfm.photos.bitmaps import is_read_by_colmap, read_alpha, read_frame
 from hm_sfm.photos.masks import Masks
 from hm_sfm.types import ImageRef
@@ -142,7 +143,7 @@ def _write_copy(copy: _Copy, folder: Path) -> None:
         path = folder / "masks" / f"{copy.name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         visible = _undistort(copy.mask * np.uint8(255), copy.camera) > 127
-        Image.fromarray(visible * np.uint8(255)).save(path, "PNG")
+        path.write_bytes(encode_picture(visible * np.uint8(255), ".png"))
 
 
 def _undistort(pixels: np.ndarray, camera: pycolmap.Camera) -> np.ndarray:

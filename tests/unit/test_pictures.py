@@ -21,9 +21,10 @@ for module in sys.argv[1:]:
     if child == 0:
         importlib.import_module(module)
         import numpy as np
-        from hm_sfm.io.pictures import encode_picture
+        from hm_sfm.io.pictures import encode_drawing, encode_picture
         for ending in (".png", ".jpg", ".webp"):
             assert encode_picture(np.zeros((64, 64, 3), np.uint8), ending)
+            assert encode_drawing(np.zeros((64, 64, 3), np.uint8), ending)
         os._exit(0)
     print(module, os.waitpid(child, 0)[1])
 """

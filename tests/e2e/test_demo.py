@@ -87,6 +87,7 @@ def test_demo_leaves_the_files_that_other_programs_rely_on(demo, read_matches):
         "registered",
         "unregistered",
         "models",
+        "masks",
         "pairs_given_up",
         "matches_denied",
         "points",

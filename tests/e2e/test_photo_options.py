@@ -127,8 +127,8 @@ def test_a_run_is_converted(reconstructed, tmp_path, run, to):
     assert (finished.code, finished.out, finished.err) == (0, f"{to}: {target}\n", "")
     expected = {
         "hloc": ["features.h5", "matches.h5", "pairs.txt"],
-        "nerfstudio": ["images", "points3D.ply", "transforms.json"],
-        "3dgs": ["images", "sparse"],
+        "nerfstudio": [".made_by_hm_sfm", "images", "points3D.ply", "transforms.json"],
+        "3dgs": [".made_by_hm_sfm", "images", "sparse"],
         "ply": ["target"],
         "txt": ["cameras.txt", "frames.txt", "images.txt", "points3D.txt", "rigs.txt"],
     }

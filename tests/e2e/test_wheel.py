@@ -20,7 +20,7 @@ def test_the_wheel_holds_all_of_the_package_and_nothing_else(wheel):
 
 
 def test_nothing_but_the_core_dependencies_is_installed(installed, tmp_path):
-    extras = ["kornia", "matplotlib", "PIL", "pillow_heif", "plyfile", "pytest", "ray", "pyright"]
+    extras = ["kornia", "matplotlib", "pillow_heif", "plyfile", "pytest", "ray", "pyright"]
     code = f"""
 import importlib.util, hm_sfm
 print(hm_sfm.__file__)

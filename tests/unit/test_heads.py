@@ -121,7 +121,8 @@ def test_homography_head_learns_a_small_warp(spacing):
     head = HomographyHead(9, 1, 2, 2, spacing)
     displacement = apply_homography(homography, make_corners(head.half)) - make_corners(head.half)
     index = torch.zeros(count, dtype=torch.int64)
-    supervision = PatchSupervision(index, cell_a, cell_b, homography, displacement, torch.ones(count, dtype=torch.bool))
+    correct, start = torch.ones(count, dtype=torch.bool), torch.zeros_like(displacement)
+    supervision = PatchSupervision(index, cell_a, cell_b, homography, displacement, correct, start)
     optimizer = torch.optim.Adam(head.parameters(), lr=3e-3)
     dense = []
     for _ in range(70):

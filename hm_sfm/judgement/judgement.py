@@ -96,26 +96,28 @@ def judge_pairs(
     votes = _collect_votes(triangles, inliers, ends, map_pair, config.max_error_px, quiet)
     closed = _measure_closing(measure_rotation_loops(rotations, triangles), votes, len(triangles))
     belief, against = weigh_pairs(inliers, triangles, closed)
-    kept = choose_believed(ends, belief, against)
-
-    believed = kept[triangles.pairs]
-    judged, denied = {}, 0
+    believed = choose_believed(ends, belief, against)
+    kept, judged, denied = believed.copy(), {}, 0
     for i, pair in enumerate(pairs):
         # Loops are heard if the two other pairs are believed.
-        trusted = (believed | (triangles.pairs == i)).all(axis=1)
-        heard = votes[i].votes[trusted[votes[i].triangle]].sum(axis=0, dtype=np.int64)
-        agreed = heard >= 0 if kept[i] else heard > 0
+        corners = triangles.pairs[votes[i].triangle]
+        heard = votes[i].votes[(believed[corners] | (corners == i)).all(axis=1)].sum(axis=0, dtype=np.int64)
+        agreed = heard >= 0 if believed[i] else heard > 0
         kept[i] |= np.count_nonzero(agreed) >= max(config.min_inliers, CONFIRMED * len(agreed))
         if kept[i]:
-            inliers_of_pair = verified[pair].inliers.copy()
-            inliers_of_pair[np.flatnonzero(inliers_of_pair)[~agreed]] = False
-            strength = verified[pair].strength * float(np.mean(agreed))
-            judged[pair] = VerifiedPair(pair, inliers_of_pair, strength)
+            judged[pair] = _keep_matches(verified[pair], agreed)
             denied += int(np.count_nonzero(~agreed))
     lost = np.flatnonzero(~kept)
     lost = lost[np.argsort(belief[lost], kind="stable")]
     given_up = tuple(GivenUpPair(verified[pairs[i]], float(belief[i])) for i in lost.tolist())
     return Judgement(judged, given_up, denied)
+
+
+def _keep_matches(verified: VerifiedPair, agreed: np.ndarray) -> VerifiedPair:
+    """The pair with those of its inliers alone that `agreed`, (inliers,) bool, names."""
+    inliers = verified.inliers.copy()
+    inliers[np.flatnonzero(inliers)[~agreed]] = False
+    return VerifiedPair(verified.pair, inliers, verified.strength * float(np.mean(agreed)))
 
 
 def _collect_votes(

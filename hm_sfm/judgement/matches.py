@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hm_sfm.geometry.homographies import apply_homographies
+from hm_sfm.keypoints.transfer import make_transfers
 from hm_sfm.types import PairMatches
 
 CELL_PX = 8.0
@@ -17,7 +18,7 @@ class PatchMap:
 
     centre: np.ndarray
     target: np.ndarray
-    """(M, 2) float64: patch centres in the one image and in the other."""
+    """(M, 2): patch centres in the one image and in the other."""
     homography: np.ndarray
     """(M, 3, 3) float64."""
     cells: np.ndarray
@@ -40,12 +41,10 @@ def map_patches(matches: PairMatches, px_scale0: float, px_scale1: float) -> tup
 
     px_scale0, px_scale1: px of the stored images per px at the matching resolution.
     """
-    scale0, scale1 = np.diag([px_scale0, px_scale0, 1.0]), np.diag([px_scale1, px_scale1, 1.0])
-    forward = np.linalg.inv(scale1) @ matches.homography.astype(np.float64) @ scale0
-    xy0, xy1 = matches.xy0 / np.float64(px_scale0), matches.xy1 / np.float64(px_scale1)
+    forward, back = make_transfers(matches, px_scale0, px_scale1)
     return (
-        PatchMap(xy0, xy1, forward, _index_cells(xy0)),
-        PatchMap(xy1, xy0, np.linalg.inv(forward), _index_cells(xy1)),
+        PatchMap(forward.centre, back.centre, forward.homography, _index_cells(forward.centre)),
+        PatchMap(back.centre, forward.centre, back.homography, _index_cells(back.centre)),
     )
 
 

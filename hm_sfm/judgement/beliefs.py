@@ -39,7 +39,7 @@ def choose_believed(ends: np.ndarray, belief: np.ndarray, against: np.ndarray) -
     """(P,) bool: the pairs to keep.
 
     ends: (P, 2) int64, the photos of each pair. Pairs without which photos would fall apart that all pairs hold
-    together are kept, the most believed first: no photo is worse off than without a judgement.
+    together are kept, the most believed first. Mapping may still leave out a photo that too few pairs are left of.
     """
     kept = (belief >= GIVEN_UP) | (against < CONTRADICTION)
     photos = ends.max(initial=-1) + 1

@@ -23,6 +23,7 @@ from hm_sfm.evaluation.comparison import load_expectation
 from hm_sfm.evaluation.loftr_style import make_keypoints
 from hm_sfm.evaluation.poses import score_model
 from hm_sfm.formats.strecha import read_strecha_cameras
+from hm_sfm.judgement.judgement import judge_pairs
 from hm_sfm.keypoints.persistence import persist_keypoints
 from hm_sfm.matching.run import match_pairs
 from hm_sfm.matching.store import MatchStore, digest_image
@@ -52,6 +53,7 @@ def compare_tracks(photos: Path, out: Path, ground_truth: Path | None) -> None:
     # Three ways from matches to keypoints.
     camera_of = {image.name: cameras.cameras[index] for image, index in zip(images, cameras.camera_index)}
     verified = verify_pairs(images, pairs, homographies.read, camera_of, px_scale, config.verification)
+    verified = judge_pairs(verified, homographies.read, camera_of, px_scale, config.verification).pairs
     max_keypoints = config.keypoints.max_keypoints
     keypoints_and_matches = {
         "persistent": persist_keypoints(
